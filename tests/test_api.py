@@ -347,9 +347,12 @@ def test_a_policy_takes_one_task(result):
     policy = result.policy()
     tasks = policy.env.tasks()
     one = jax.tree.map(lambda x: x[0], tasks)
-    for wrong in (tasks, 3):
-        with pytest.raises(InputError, match="takes one task, not"):
+    for wrong, fix in ((tasks, r"jax\.tree\.map"), (3, "NAME=VALUE")):
+        with pytest.raises(InputError, match=f"takes one task, not .*: .*{fix}"):
             policy(np.zeros(9), wrong)
+    for name, said in (("key", r"key is one of jax\.random\.key, not 3"), ("memory", r"memory is what policy\.begin")):
+        with pytest.raises(InputError, match=said):
+            policy(np.zeros(9), one, **{name: 3})
     with pytest.raises(InputError, match=r"give a task, or its parameters .*, not both"):
         policy(np.zeros(9), one, size=1.0)
     with pytest.raises(InputError, match=r"has shape \(9,\), not \(4, 3, 9\); a batch has one axis before it"):

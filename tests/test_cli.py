@@ -415,7 +415,8 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env", "--env needs a value"),
         ("--no-steps", "--steps is no switch"),
         ("finger-spin", "'finger-spin' belongs to no flag; write --NAME=VALUE"),
-        ("--profile=3", "--profile is a switch and takes no value; leave out '=3'"),
+        ("--profile=3", "--profile is a switch and takes no value: --profile is on, and --no-profile off"),
+        ("--stagger=off", "--stagger is a switch and takes no value: --stagger is on, and --no-stagger off"),
         ("--env.vary=3", "--env.vary needs the name of a parameter: --env.vary.NAME=VALUES"),
         ("-x", "'-x' has one dash, and flags have two: --x"),
         ("-env=bandit", "'-env=bandit' has one dash, and flags have two: --env=bandit"),
@@ -425,7 +426,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--agent.hidden wide", "wide"),
         ("--agent.hidden", "at least one layer"),
         ("--agent.conditioning=onehot", "onehot"),
-        ("--agent.shared-temperature=yes", "yes"),
+        ("--agent.shared-temperature=yes", "--agent.shared-temperature is on, and --agent.no-shared-temperature off"),
         ("--seed=-1", "seed must be at least 0"),
         ("--seed=3000000000", "seed must be at most 2147483647"),
         ("--steps=0", "steps must be at least 1"),
@@ -491,6 +492,47 @@ def test_a_file_of_ones_own_that_fails_is_told_with_its_line(complaint, tmp_path
     (tmp_path / "mine.py").write_text(text)
     assert said in complaint("train", f"--import={tmp_path / 'mine.py'}", "--list")
     assert "mine" not in sys.modules
+
+
+OWN_FAMILY = """import dataclasses
+import jax.numpy as jnp
+import mtjax
+from mtjax.envs import Domain, Parameter
+def set_mass(spec, value):
+    spec.geom("box").mass = value
+@dataclasses.dataclass(frozen=True)
+class Cart(Domain):
+    model_file = '''<mujoco><worldbody><body name="cart"><joint name="x" type="slide"/><geom name="box" size=".1"/>
+    </body></worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>'''
+    episode_steps = 100
+    parameters = {"mass": Parameter("kg", 1.0, set_mass)}
+    def start(self, task, key):
+        return jnp.zeros(1), jnp.zeros(1)
+    def observe(self, task, world):
+        return world.qpos
+    def reward(self, task, world, action):
+        return world.qpos[0]
+mtjax.register("cart", Cart, vary={"mass": "1,2"})
+"""
+
+
+@pytest.mark.parametrize(
+    "right, wrong, said",
+    [
+        ('geom("box")', 'geom("bos")', r"line 6: Cart\.parameters\['mass'\] \(set_mass\): unknown geom"),
+        (".mass = value", ".rgba[0] = value / 9", r"line 12: Cart\.parameters\['mass'\] changes nothing"),
+        ("return world.qpos\n", "return world.qpoz\n", r"line 16: Cart\.observe: AttributeError"),
+        ("return world.qpos[0]", "return world.qpos", r"line 17: Cart\.reward must return a number"),
+        ("def start", "def begin", r"line 8: Cart cannot be made: .* method '?start"),
+        ("(Domain)", "", r"line 8: Cart must be a subclass of Domain"),
+        ('"1,2"', '"one"', r"line 19: cannot read the values 'one' of mass"),
+    ],
+)
+def test_a_family_of_ones_own_that_is_wrong_is_told_with_its_line(complaint, tmp_path, right, wrong, said):
+    """And not with that of the call that registers it."""
+    assert OWN_FAMILY.count(right) == 1
+    (tmp_path / "mine.py").write_text(OWN_FAMILY.replace(right, wrong))
+    assert re.search(said, complaint("train", f"--import={tmp_path / 'mine.py'}", "--list"))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])

@@ -178,6 +178,13 @@ WRONG = {
         r"size is a number, or an array \(2,\) .* shape \(3,\)",
     ),
     "single": ((np.zeros(9),), {"size": np.ones(2)}, r"size is a number, not of shape \(2,\)"),
+    "text": ((np.zeros(9),), {"size": "a"}, "size takes numbers, not text"),
+    "texts": ((["a"] * 9,), {"size": 1.0}, "obs takes numbers, not text"),
+    "no value": ((np.zeros(9),), {"size": None}, "size takes numbers, not other objects"),
+    "too large": ((np.zeros(9),), {"size": 10**5000}, "size takes numbers, not other objects"),
+    "complex": ((np.zeros(9),), {"size": 1j}, "size takes numbers, not complex ones"),
+    "ragged": (([[1], [1, 2]],), {"size": 1.0}, "obs takes numbers, not lists of different lengths"),
+    "key": ((jax.random.key(0),), {"size": 1.0}, "obs takes numbers, not other objects"),
     "dict": (({"pixels": np.zeros(3)},), {"size": 1.0}, r"an observation is a dict of {'obs': \(9,\)}"),
 }
 

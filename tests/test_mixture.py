@@ -223,6 +223,15 @@ def test_names_of_families_and_tasks():
     assert "2 training tasks" in mixture(["cartpole-swingup", "walker-walk"]).summary
 
 
+def test_a_summary_says_what_every_episode_draws():
+    """A range without a number of steps is of one task, and not of its two ends."""
+    drawn = make("finger-spin", vary={"size": "1:1.2", "mass": "1,2"})
+    assert drawn.summary.startswith("2 training tasks, size 1 to 1.2 drawn each episode, mass 1 to 2, split")
+    assert make("finger-spin", vary={"size": "1:1.2:2"}).summary.startswith("2 training tasks, size 1 to 1.2, split")
+    both = mixture([make("finger-spin", vary={"size": "1:1.2"}), "walker-walk"])
+    assert "2 families: finger-spin (1: size 1 to 1.2 drawn each episode), walker-walk; split" in both.summary
+
+
 @pytest.mark.parametrize(
     "make_it, said",
     [

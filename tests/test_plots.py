@@ -73,7 +73,7 @@ def test_seeds_of_equal_settings_are_joined_and_others_are_named_apart(runs, mak
 
 def test_learning_curves_are_means_with_bands(runs, tmp_path):
     """Of one family; several are drawn in a grid."""
-    with pytest.raises(InputError, match=r"is of one family.*families draws several"):
+    with pytest.raises(InputError, match=r"the figure curves is of one family, and .*; draw the figure families"):
         report.learning_curves(runs)
     folders = [tmp_path / "runs" / name for name in ("a1", "b")]
     axes = report.learning_curves(folders)
@@ -176,7 +176,7 @@ def test_all_figures_at_once(runs, tmp_path, capsys, monkeypatch):
     mtjax.plot.main([runs, "--figure", "all"])
     names = ("families", "iqm", "profile", "improvement")
     assert {path.name for path in tmp_path.glob("*.png")} == {f"runs-{name}.png" for name in names}
-    assert "curves: left out, as learning_curves is of one family" in capsys.readouterr().out
+    assert "curves: left out, as the figure curves is of one family" in capsys.readouterr().out
 
 
 def test_a_metric_is_drawn_in_the_place_of_returns(runs, make_run, tmp_path, monkeypatch):

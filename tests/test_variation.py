@@ -72,7 +72,7 @@ def test_random_tasks_fill_the_ranges_and_follow_their_seed():
 
 def test_random_ranges_are_of_fixed_tasks_not_of_episodes():
     found = vary({"a": "1:3"}, PARAMETERS, "random", 3, "none", 4, 0)
-    assert found.draws is None and len(found.rows["train"]) == 3
+    assert found.draws is None and len(found.rows["train"]) == 3 and found.redrawn == ()
     assert (found.low, found.high) == (1, 3)
 
 

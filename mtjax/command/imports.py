@@ -1,6 +1,8 @@
 """The user's own files, which ``--import=FILE.py`` runs."""
 
+import ast
 import importlib.util
+import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -48,16 +50,34 @@ def _import(path: Path) -> None:
     sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except InputError as error:
+    except Exception as error:
         del sys.modules[path.stem]
-        raise InputError(f"{str(path)!r}{_line_of(error, path)}: {error}") from error
-    except Exception as error:  # of the user's own code
-        del sys.modules[path.stem]
-        raise InputError(f"{str(path)!r}{_line_of(error, path)}: {type(error).__name__}: {error}") from error
+        line, kind = _line_of(error, path), "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        raise InputError(f"{str(path)!r}{f', line {line}' * bool(line)}: {kind}{error}") from error
 
 
-def _line_of(error: Exception, path: Path) -> str:
-    """Return the line of a file in which an error arose, as ", line 3"; empty if it is unknown."""
+def _line_of(error: BaseException, path: Path) -> int:
+    """Return the line of a file in which an error arose; 0 if it is unknown.
+
+    Of a class that is refused it is the line of its method that failed, or of the name that the message begins with,
+    and not that of the call that registers it.
+    """
+    if error.__context__ is not None and (line := _line_of(error.__context__, path)):
+        return line
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
     lines += [error.lineno] if isinstance(error, SyntaxError) and error.filename == str(path) else []
-    return f", line {lines[-1]}" if lines else ""
+    named = re.match(r"(\w+)(?:\.(\w+))?", str(error)) if isinstance(error, InputError) and lines else None
+    return (named and _line_of_name(path, *named.groups())) or (lines or [0])[-1] or 0
+
+
+def _line_of_name(path: Path, cls: str, name: str | None) -> int:
+    """Return the line of a class of a file, or of what it defines by a name; 0 if there is none."""
+    found = [node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef) and node.name == cls]
+    inside = [node for each in found for node in each.body if name and name in _names_of(node)]
+    return next((node.lineno for node in (*inside, *found)), 0)
+
+
+def _names_of(node: ast.stmt) -> list[str | None]:
+    """Return the names that a statement of a class defines."""
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    return [getattr(node, "name", None), *(getattr(target, "id", None) for target in targets)]

@@ -42,10 +42,8 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
 def _unread(value: str, argv: Sequence[str]) -> str:
     """Return what is wrong with a word that belongs to no flag: a switch came with a value, or there is no flag."""
     switch = next((word.split("=")[0] for word in argv if word.startswith("--") and word.endswith(f"={value}")), None)
-    if switch is not None and value.lower() == "false":
-        return f"{switch} is a switch and takes no value; write {switched_off(switch)}"
     if switch is not None:
-        return f"{switch} is a switch and takes no value; leave out {'=' + value!r}"
+        return f"{switch} is a switch and takes no value: {switch} is on, and {switched_off(switch)} off"
     return f"{value!r} belongs to no flag; write --NAME=VALUE, and --help lists the names"
 
 

@@ -46,9 +46,7 @@ def register(name: str, thing: "type | str", **defaults: Any) -> None:
         return envs.register(name, thing, **defaults)
     if issubclass(thing, BaseAgent):
         return _register_agent(name, agents.Preset(first_sentence(thing.__doc__ or thing.__name__), defaults, thing))
-    if defaults:
-        raise InputError(f"a part has the defaults of its class; leave out {', '.join(defaults)}")
-    _register_part(name, thing)
+    _register_part(name, thing, defaults)
 
 
 def _register_agent(name: str, preset: agents.Preset) -> None:
@@ -64,11 +62,13 @@ def _register_agent(name: str, preset: agents.Preset) -> None:
         raise
 
 
-def _register_part(name: str, part: type) -> None:
+def _register_part(name: str, part: type, defaults: dict[str, Any]) -> None:
     kind = next((kind for kind in CHOICES if issubclass(part, plainest(kind))), None)
     if kind is None:
         bases = ", ".join(plainest(kind).__name__ for kind in CHOICES)
         raise InputError(f"{part.__name__} must be a subclass of Domain, Family, BaseAgent, or of one of {bases}")
+    if defaults:
+        raise InputError(f"a part has the defaults of its class; leave out {', '.join(defaults)}")
     if name in PARTS[kind]:
         raise InputError(f"{kind} {name!r} exists already; choose another name")
     if not dataclasses.is_dataclass(part):

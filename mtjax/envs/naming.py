@@ -104,7 +104,8 @@ def varied(family: Any) -> tuple[str, ...]:
 
 def ends(family: Any) -> str:
     """Return the parameters that vary in a family's training, with their least and greatest values."""
-    return ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in family.variation.ranges)
+    drawn = dict.fromkeys(family.variation.redrawn, " drawn each episode")
+    return ", ".join(f"{name} {low:g} to {high:g}{drawn.get(name, '')}" for name, low, high in family.variation.ranges)
 
 
 @property
@@ -122,9 +123,9 @@ def summary(env: Any) -> str:
 
 
 def _extent(family: Any) -> str:
-    """Return how many tasks a family of a mixture trains on, and in what they differ; nothing of one task."""
+    """Return how many tasks a family of a mixture trains on, and in what they or episodes differ; else nothing."""
     count, told = family.train_count, ends(family)
-    return f" ({count}{': ' * bool(told)}{told})" if count > 1 else ""
+    return f" ({count}{': ' * bool(told)}{told})" if count > 1 or told else ""
 
 
 def _variation_of_one(env: Any) -> Any:

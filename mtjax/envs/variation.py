@@ -58,6 +58,12 @@ class Variation:
         return tuple(name for name, _, _ in self.ranges)
 
     @property
+    def redrawn(self) -> tuple[str, ...]:
+        """Return the parameters of which every episode of some task draws a value of its own."""
+        spread = () if self.draws is None else np.ptp(self.draws, axis=1).max(axis=0, initial=0.0)
+        return tuple(name for name, most in zip(self.names, spread, strict=False) if most > 0)
+
+    @property
     def counts(self) -> dict[str, int]:
         """Return the number of tasks of each split."""
         return {split: len(rows) for split, rows in self.rows.items()}

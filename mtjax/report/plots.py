@@ -31,7 +31,7 @@ _MOST_NAMED = 3  # families in a title
 def learning_curves(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw the mean return of a split over environment steps, a line for each agent, of runs of one family."""
     found = _of_split(runs, split)
-    _require_one_family(found, "learning_curves", "families")
+    _require_one_family(found, "curves", "; draw the figure families")
     axes = ax if ax is not None else figures.new_axes()
     for index, one in enumerate(found):
         figures.draw_curve(axes, one.steps, one.returns[split], _label(one), index)
@@ -76,7 +76,7 @@ def return_by_parameter(runs: Any = "runs/*", ax: "Axes | None" = None) -> "Axes
     tasks are numbered, and no line joins them.
     """
     found = _of_split(runs, "train")
-    _require_one_family(found, "return_by_parameter", None)
+    _require_one_family(found, "parameter")
     axes = ax if ax is not None else figures.new_axes()
     for index, one in enumerate(found):
         splits = [split for split in SPLITS if one.returns[split].size]
@@ -224,11 +224,10 @@ def _row_axes(rows: Sized) -> "Axes":
     return figures.new_axes(height=1.4 + 0.4 * len(rows))
 
 
-def _require_one_family(found: list[Learned], function: str, instead: str | None) -> None:
+def _require_one_family(found: list[Learned], figure: str, instead: str = "") -> None:
     names = list(dict.fromkeys(one.env for one in found))
     if len(names) > 1:
-        hint = f"; {instead} draws several" if instead else ""
-        raise InputError(f"{function} is of one family, and these runs are of {', '.join(names)}{hint}")
+        raise InputError(f"the figure {figure} is of one family, and these runs are of {', '.join(names)}{instead}")
 
 
 def _label(one: Learned) -> str:

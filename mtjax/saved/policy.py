@@ -78,12 +78,18 @@ class Policy:
             InputError: shapes or names are others, or the task is not one task.
         """
         if task is not None and (not isinstance(task, Task) or np.ndim(task.id)):
-            raise InputError(f"policy(obs, task) takes one task, not {task!r}: jax.tree.map(lambda x: x[0], tasks)")
+            fix = "jax.tree.map(lambda x: x[0], tasks)" if isinstance(task, Task) else "policy(obs, NAME=VALUE)"
+            raise InputError(f"policy(obs, task) takes one task, not {shown(task)}: {fix}")
         if task is not None and parameters:
             raise InputError(f"give a task, or its parameters {sorted(parameters)} by name, not both")
+        if key is not None and not hasattr(key, "dtype"):
+            raise InputError(f"key is one of jax.random.key, not {shown(key)}")
+        if memory is not None and jax.tree.structure(memory) != self._memory_form:
+            raise InputError(f"memory is what policy.begin(task) and policy.remember return, not {shown(memory)}")
         wanted = by_name(self.takes)
         given = standalone.entries(obs, wanted)
         try:
+            standalone.require_numbers(given)
             size = standalone.batch_size(*({k: np.shape(x) for k, x in each.items()} for each in (wanted, given)))
             standalone.require_bytes(given)
             task, each = (task, False) if task is not None else self._task(parameters, size)
@@ -110,6 +116,11 @@ class Policy:
         each = any(map(np.ndim, values))
         values = jnp.stack(jnp.broadcast_arrays(*map(jnp.float32, values)), axis=-1) if values else jnp.zeros(0)
         return (jax.vmap(self.task_of) if each else self.task_of)(values), each
+
+    @cached_property
+    def _memory_form(self) -> Any:
+        task = jax.tree.map(lambda x: x[0], self.env.tasks("all")._replace(draws=None))
+        return jax.tree.structure(jax.eval_shape(self.begin, task))
 
     @cached_property
     def _reads_parameters(self) -> bool:

@@ -148,6 +148,7 @@ def observed(meta: dict[str, Any], obs: Any) -> tuple[list[np.ndarray], int | No
     """Return the arrays that a policy takes of an observation, in their order, and the size B if it is a batch."""
     shapes = shapes_of(meta)
     given = entries(obs, shapes)
+    require_numbers(given)
     arrays = {name: np.asarray(x, None if name == PICTURES else np.float32) for name, x in given.items()}
     size = batch_size(shapes, {name: x.shape for name, x in arrays.items()})
     require_bytes(arrays)
@@ -171,6 +172,26 @@ def _entry(tree: Any, name: str) -> Any:
     if isinstance(tree, Mapping):
         return tree[name]
     return tree[int(name)] if isinstance(tree, list | tuple) and name.isdigit() else getattr(tree, name)
+
+
+def require_numbers(given: Mapping[str, Any]) -> None:
+    """Raise ValueError if a value is neither a real number nor an array of such."""
+    told = {"U": "text", "S": "text", "c": "complex ones", "lists": "lists of different lengths"}
+    for name, x in given.items():
+        kind = _kind(x)
+        if kind not in "biufV":  # V: bfloat16
+            raise ValueError(f"{name} takes numbers, not {told.get(kind, 'other objects')}")
+
+
+def _kind(x: Any) -> str:
+    """Return the letter of NumPy for what an array, or what becomes one, holds."""
+    dtype: Any = getattr(x, "dtype", None)
+    try:
+        return dtype.kind if hasattr(dtype, "kind") else np.asarray(x).dtype.kind
+    except TypeError:  # a key of random numbers
+        return "O"
+    except ValueError:
+        return "lists"
 
 
 def require_bytes(obs: dict[str, Any]) -> None:
@@ -206,6 +227,7 @@ def ordered(names: list[str], parameters: dict[str, Any], needed: bool, size: in
         given = dict.fromkeys(names, 0.0)
     if set(given) != set(names):
         raise ValueError(f"give the task's parameters {names}, not {sorted(given)}")
+    require_numbers(given)
     for name, value in given.items():
         if np.shape(value) not in ((), (size,)):
             of_batch = "" if size is None else f", or an array ({size},) as there are {size} observations"
