@@ -182,6 +182,7 @@ def test_the_policy_that_learns_is_the_one_that_played(way):
     assert history[0]["ratio"].max() < 1e-4 and np.all(history[0]["bad_step"] == -1)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_it_explores_as_well_as_can_be():
     """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67."""
