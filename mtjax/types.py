@@ -303,6 +303,13 @@ class Lasting(Env, Protocol):
     def observe_worlds(self, tasks: Task, states: Any) -> Any: ...  # what agents see of states, leaves (S, T, E, ...)
 
 
+class Returning(Lasting, Protocol):
+    """An environment that has a task of going back to the start, as the curriculum forward-backward asks."""
+
+    def returning(self, task: Task) -> Task: ...  # whose end is where worlds of ``task`` begin
+    def distance(self, task: Task, state: Any) -> Array: ...  # of a state to the task's end, which has at most 1
+
+
 class Storage(NamedTuple):
     """Says how the data of an experience lies."""
 

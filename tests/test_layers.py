@@ -201,7 +201,7 @@ READ = {
 }
 READERS = ("learning", "compiling", "parallel.axes", "training.run", "training.memory", "training.host_replay")
 KNOWN = {  # where it is known which class it is
-    types.Env: {"calls", "relabels", "varied", "fresh_goals", "observe_worlds"},
+    types.Env: {"calls", "relabels", "varied", "fresh_goals", "observe_worlds", "returning", "distance"},
     types.Agent: {"adapt", "conditioning", "gradients", "heads", "representation", "view"},
     types.Experience: {"capacity", "hindsight", "n_step"},
 }

@@ -10,7 +10,7 @@ import pytest
 from probes import QUICK, configure, tiny
 
 import mtjax
-from mtjax.learning import curricula, loop
+from mtjax.learning import combinations, curricula, loop
 from mtjax.learning.evaluation import draw_in_turn
 from mtjax.learning.trials import ResetFree
 from mtjax.types import InputError, Transition
@@ -278,8 +278,8 @@ def test_ways_back_are_refused_where_there_are_none():
     for name in ("forward-backward", "graph"):
         settings = loop.Settings(curriculum=name)
         with pytest.raises(InputError, match=f"the curriculum {name} is for worlds that are not reset; add --reset-fr"):
-            loop.require_trials(settings, ENV, agent)
+            combinations.require_env(settings, ENV, agent)
         settings = dataclasses.replace(settings, reset_free=True)
-        loop.require_trials(settings, ENV, agent)
+        combinations.require_env(settings, ENV, agent)
         with pytest.raises(InputError, match="needs a way back to the start"):
-            loop._require_way_back(settings, NoWayBack())
+            combinations._require_way_back(settings, NoWayBack())

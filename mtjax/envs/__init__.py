@@ -237,7 +237,7 @@ _ANALYTIC: dict[str, Entry] = {
             "num_tasks": 10,
         },
     ),
-    "tabletop": ("tabletop:Tabletop", {"vary": {"goal": "0,1,2,3"}, "split": "none"}),
+    "tabletop": ("tabletop:Tabletop", {"vary": {"goal": "0,1,2,3"}, "split": "none", "num_tasks": 1}),
     "trading": ("trading:Trading", {"vary": {"risk-aversion": "0.5:5:10"}}),
 }
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.tasks import draw_at, episode_task
-from mtjax.types import Array, InputError, Key, Task
+from mtjax.types import Array, InputError, Key, Returning, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ForwardBackward(Everything):
     Han, Levine and Abbeel 2015, "Learning compound multi-step controllers under unknown dynamics"; EARL's FBRL.
     """
 
-    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+    def follow(self, env: Returning, listed: Task, task: Task, state: Any, key: Key) -> Task:
         """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``."""
         back = env.returning(task)
         same = jax.tree.map(lambda x, y: jnp.all(x == y), back.goal, task.goal)
@@ -60,7 +60,7 @@ class Graph(Everything):
     one, and a world that is at none towards the nearest. Gupta et al. give edges by hand.
     """
 
-    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+    def follow(self, env: Returning, listed: Task, task: Task, state: Any, key: Key) -> Task:
         draws = jax.vmap(draw_at, (None, 0))(listed, jnp.arange(len(listed.draws.id)))
         nodes = jax.tree.map(lambda x, y: jnp.append(x, y[None], axis=0), draws, env.returning(task))
         far = jax.vmap(env.distance, (0, None))(nodes, state)

@@ -45,8 +45,8 @@ def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> 
         require(config, start)
     if config.env:
         _require_named(config)
-    _require_policy(learner, family)
     combinations.require_env(config.played, family, learner)
+    _require_policy(learner, family)
     if config.mesh is not None and (lost := forgetful(family)):
         raise InputError(
             f"{lost} steps on the host of one device, and this run is on {config.mesh.size}; show JAX one, such "
