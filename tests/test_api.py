@@ -35,6 +35,7 @@ def result(short_family, tmp_path_factory):
     return mtjax.train("finger-short", "sac-conditioned", steps=600, directory=place, **PLAN, **SMALL)
 
 
+@pytest.mark.slow
 def test_a_run_of_python_is_that_of_the_command_line(result, finished_run):
     """The same settings, metrics and evaluations, to the bit."""
     ours, theirs = (from_json(folder / "config.json") for folder in (result.directory, finished_run))

@@ -107,6 +107,7 @@ def test_what_is_heard_are_means_over_seeds_and_chunks():
     np.testing.assert_array_equal(second[1], [8, 8])
 
 
+@pytest.mark.slow
 def test_a_curriculum_hears_of_the_tasks_that_it_plays_and_changes_only_when_it_is_due():
     """Of the second of two tasks alone an episode's return is negative, so it is played on as the hardest."""
     tasks = jax.tree.map(lambda x: jnp.stack([x[0], x[0], x[0]]), Walk().tasks())

@@ -200,6 +200,7 @@ def last_returns(result):
 LEARN = {"steps": 2 * 16 * 30 * 40, "num_envs": 16, "unroll": 30, "actor_lr": 3e-3, "eval_every": 10**6}
 
 
+@pytest.mark.slow
 def test_a_learner_comes_to_act_as_its_teacher():
     """Also in states that tell what to do: the divergence falls to 0, and the return is the teacher's."""
     env = Probe("by-both", 1)

@@ -121,7 +121,7 @@ def alone(engine, task, world, action):
     return state, np.float32(data.sensordata)
 
 
-@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY][::2]))
+@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY][::4]))
 def test_c_steps_as_plain_mujoco_does(name):
     """Bit for bit in every world, for three steps of which the later ones go on from the batch's own state."""
     tasks, world, action, _ = played(name)

@@ -83,6 +83,7 @@ def test_what_is_pulled_acts_as_what_was_pushed(copied_run, remote):
     assert json.loads((remote / NAME / "config.json").read_text())["plan"]["seed"] == 1
 
 
+@pytest.mark.slow
 def test_a_policy_of_the_package_and_a_folder_can_be_pushed(copied_run, remote):
     """By name or path; of the first the page says that its scores are not there."""
     name = "finger-spin-vary-size/sac-conditioned"

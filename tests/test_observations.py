@@ -122,6 +122,7 @@ def test_networks_learn_from_a_tree_what_they_learn_from_its_vector(case):
     jax.tree.map(np.testing.assert_array_equal, metrics, wanted)
 
 
+@pytest.mark.slow
 def test_a_replay_keeps_ints_as_ints():
     """The store has the arrays as the family observes them."""
     state, _ = train(TREE, agent_of("sac"), LOOP)

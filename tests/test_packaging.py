@@ -52,6 +52,7 @@ def test_wheel_holds_the_package_and_nothing_beside_it(built):
     assert any(name.endswith("models/finger.xml") for name in inside) and "mtjax/configs/default.toml" in inside
 
 
+@pytest.mark.slow
 def test_source_archive_holds_what_a_contributor_needs(built):
     """The package, tests, benchmarks and pins; nothing of the working folder's own."""
     source, _, _ = built

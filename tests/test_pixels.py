@@ -43,6 +43,7 @@ def play(env, actions, task=None):
 ACTIONS = (1.0, -1.0, 0.5, 1.0, 1.0, -0.5)
 
 
+@pytest.mark.slow
 def test_observation_is_the_newest_picture_and_the_state_family_s_own():
     env, plain = pictured(state="also"), mtjax.make("pendulum-swingup", engine="c")
     assert env.spec.obs["pixels"] == jax.ShapeDtypeStruct((SIZE, SIZE, 3), jnp.uint8) and env.spec.frames == 3

@@ -274,6 +274,7 @@ def test_ppo_finds_the_best_arm_of_every_task():
 LEVERS = Levers(vary={"turn": "0,1"}, split="none")
 
 
+@pytest.mark.slow
 def test_ppo_finds_the_best_places_of_two_levers():
     """In all lights of all tasks, so that every episode returns the 6 that is most."""
     given = {"num_envs": 8, "hidden": (32,), "actor_lr": 3e-3, "eval_episodes": 5}

@@ -187,6 +187,7 @@ def test_a_copy_is_its_source_to_the_bit(chosen):
     assert first.state.origins.tolist() == [0, 1, 1, 3]
 
 
+@pytest.mark.slow
 def test_a_copy_has_numbers_of_its_own(chosen):
     """Near those of its source."""
     state, first, _ = chosen

@@ -172,6 +172,7 @@ def test_a_policy_plays_alone_and_a_split_alone_plays_the_same_episodes(result, 
         np.testing.assert_array_equal(alone.values[split], found.values[split])
 
 
+@pytest.mark.slow
 def test_other_values_are_played(result, found):
     """As the split "given", where a value that trained has the same policy."""
     given = mtjax.evaluate(result, vary={"size": [1.0, 1.1, 1.5]}, episodes=2)

@@ -59,6 +59,7 @@ def test_packnet_forgets_nothing_to_the_bit(packed):
         assert not np.array_equal(outputs(agent, second, 2, seed), outputs(agent, third, 2, seed))
 
 
+@pytest.mark.slow
 def test_packnet_numbers_tasks_as_they_end_and_shares_weights_out(packed):
     (first, second, third, again), _ = packed
     held = [state.nets["continual"] for state in (first, second, third, again)]

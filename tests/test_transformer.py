@@ -137,6 +137,7 @@ def rollout(agent):
     return steps._replace(extras=Taken(raw, normal() - 2), memory=Memory(None, hidden))
 
 
+@pytest.mark.slow
 def test_each_loss_trains_all_of_it():
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **SETTINGS)
     state = agent.init(SPEC, TASKS, KEY)
@@ -172,6 +173,7 @@ class Kept(Ratios):
         return super().observe(state, steps, tasks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [SETTINGS, pytest.param({"conditioning": "recurrent"}, marks=pytest.mark.slow)])
 def test_the_policy_that_learns_is_the_one_that_played(way):
     """A rollout keeps its first memory alone, and tells of it what actions were drawn with: ratios begin at 1."""

@@ -185,6 +185,7 @@ def opengl():
         pytest.skip("needs OpenGL")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_moving_worlds_are_those_of_films(finished_run):
     """At every time the frame that a film of the same episode has; the last one stays."""
@@ -339,6 +340,7 @@ def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
 @pytest.mark.parametrize("how", ["closed", "interrupted"])
 def test_a_page_ends_with_its_input_or_by_ctrl_c(free, how):
     """A run's page has a pipe as its input, which is closed when the run ends or is killed."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background, and so in what it starts
     words = [sys.executable, "-m", "mtjax.evaluate", "--run=point-mass-vary-goal/sac-conditioned", f"--view={free}"]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdin is not None
