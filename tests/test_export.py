@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import FEW, Levers, family_for, param, pick, slow_but, tiny, with_nets
+from probes import FEW, Levers, family_for, pick, slow_but, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
