@@ -59,7 +59,7 @@ class Variation:
 
     @property
     def redrawn(self) -> tuple[str, ...]:
-        """Return the parameters of which every episode of some task draws a value of its own."""
+        """Return the parameters whose values episodes draw anew, in at least one task."""
         spread = () if self.draws is None else np.ptp(self.draws, axis=1).max(axis=0, initial=0.0)
         return tuple(name for name, most in zip(self.names, spread, strict=False) if most > 0)
 

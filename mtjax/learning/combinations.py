@@ -38,7 +38,7 @@ def require_env(settings: Settings, env: Env, agent: Agent) -> None:
 
     Raises:
         InputError: the replay does not fit it, its trials draw tasks to which the agent would adapt, its worlds cannot
-            go on, or it is a mixture of which some tasks cannot be played alone.
+            go on, or some tasks of a mixture cannot be played alone.
     """
     agent.experience.check(env, settings.num_envs, settings.chunk_steps, agent.unroll)
     tasks = env.tasks("train")

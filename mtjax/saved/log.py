@@ -62,7 +62,7 @@ def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Return lines of cells as texts, of which each column is as wide as its widest cell."""
+    """Return lines of cells as texts. Each column is as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return ["  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)) for line in lines]
 

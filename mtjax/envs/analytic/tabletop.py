@@ -137,7 +137,7 @@ class Tabletop(Pictured, Family):
 
     def reward(self, task: Task, state: TableState, action: Array) -> Array:
         """Return 1 where all is where it should be, and in a dense reward the metres gained, ()."""
-        there = (self.distance(task, state) <= 1).astype(jnp.float32)
+        there = self.metrics(task, state, action)["success"]
         return there + state.gained if self.reward_kind == "dense" else there
 
     def metrics(self, task: Task, state: TableState, action: Array) -> dict[str, Array]:

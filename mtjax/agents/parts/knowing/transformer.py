@@ -32,7 +32,7 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, kept: tuple[Array, Array], earlier: Array) -> tuple[Array, Array, Array]:
-        """Map R streams of L steps, of which each has the first stream as its past.
+        """Map R streams of L steps. The past of each is the first stream.
 
         Args:
             x: (..., R, L, D).
