@@ -10,7 +10,7 @@ tasks have networks of their own. The figure is of the weights in the last one: 
 
 import argparse
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,8 @@ class Grid:
     task's corner. Start: any cell but the corners. Episode: 20 steps; it terminates in any corner.
     """
 
+    ends_early: ClassVar[bool] = True
+    finite_horizon: ClassVar[bool] = False
     width: int = 7
     height: int = 7
     orders: tuple[tuple[int, ...], ...] = ORDERS
