@@ -327,6 +327,8 @@ class Experience(Protocol):
     storage: ClassVar[Storage]
 
     @property
+    def hindsight(self) -> float: ...  # the share of what is learned from that is relabelled as another task's
+    @property
     def steps(self) -> int: ...  # of every environment that are collected before the agent learns
     @property
     def adaptations(self) -> int: ...  # how often the agent adapts meanwhile: between as many rollouts and one more

@@ -200,7 +200,7 @@ def test_steps_are_relabelled_as_the_other_task_would_have_had_them(env):
 
 def chosen(name, task, state, count=200):
     """The goals that may follow, by how often they do."""
-    choose = lambda key: curricula.follow(curricula.read(name), ENV, listed(), task, state, key).goal["goal"]
+    choose = lambda key: curricula.read(name).follow(ENV, listed(), task, state, key).goal["goal"]
     goals = np.asarray(jax.vmap(choose)(jax.random.split(KEY, count)))
     return {int(goal): float(np.mean(goals == goal)) for goal in np.unique(goals)}
 

@@ -1,7 +1,7 @@
 """Environments whose observations hold the last pictures, for users who keep no memory of their own."""
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 from mtjax import frames
 from mtjax.envs.mixtures import require_family
@@ -25,7 +25,6 @@ class Stacked:
     ``reset`` and ``step`` are as the family's. Its state holds the pictures before the newest.
     """
 
-    ends_early: ClassVar[bool] = True  # as far as is known of the family
     family: Pictured
 
     def __post_init__(self):
@@ -40,6 +39,11 @@ class Stacked:
     def task_values(self, split: str) -> Any:
         """Return the values (T,) that tell the tasks of a split apart."""
         return self.family.task_values(split)
+
+    @property
+    def ends_early(self) -> bool:
+        """Return whether episodes may end before their limit."""
+        return self.family.ends_early
 
     @property
     def finite_horizon(self) -> bool:

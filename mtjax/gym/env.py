@@ -118,7 +118,7 @@ def observed(obs: Any) -> Any:
 
 def played(family: Env) -> Any:
     """Return what Gymnasium steps: a family, or one with pictures whose observations hold the last few of them."""
-    return envs.stacked(family) if getattr(family, "pixels", 0) else family
+    return envs.stacked(family) if shown(family.spec.obs) else family
 
 
 def read_action(action: Any, space: spaces.Space) -> np.ndarray:
@@ -220,7 +220,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
         """Return a picture (height, width, 3) uint8 of the world as it is now."""
         if self.render_mode is None or self._step is None:
             raise InputError("to draw, give render_mode='rgb_array' to make, and reset first")
-        state = self._step.state.world if getattr(self.family, "pixels", 0) else self._step.state
+        state = self._step.state.world if shown(self.family.spec.obs) else self._step.state
         return render.film(self.family, int(self._task.row), jax.tree.map(lambda x: x[None], state))[0]  # type: ignore
 
     def get_task_obs(self) -> Any:

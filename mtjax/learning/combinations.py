@@ -8,8 +8,6 @@ from mtjax import frames
 from mtjax.agents import BaseAgent
 from mtjax.agents.consolidating import consolidates
 from mtjax.envs import Family
-from mtjax.experience import Replay
-from mtjax.learning import curricula
 from mtjax.learning.loop import Settings
 from mtjax.types import Agent, Env, InputError
 
@@ -22,7 +20,7 @@ def require_agent(settings: Settings, agent: Agent) -> None:
     """
     if settings.trials > 1:
         _require_repeatable(settings.trials, agent)
-    if consolidates(agent) and not isinstance(settings.plays, curricula.Sequence):
+    if consolidates(agent) and not settings.plays.in_turn:
         raise InputError(
             "continual, reset-optimizer and shrink-and-perturb are for tasks one after another: use "
             "--curriculum=sequence:STEPS"
@@ -69,7 +67,7 @@ def _require_turns(settings: Settings, agent: Agent) -> None:
 
 def _require_way_back(settings: Settings, env: Any) -> None:
     """Refuse a curriculum that asks worlds to go back to their start, where they are reset or have no task for it."""
-    if not isinstance(settings.plays, curricula.ForwardBackward | curricula.Graph):
+    if not settings.plays.returns:
         return
     told = f"the curriculum {settings.curriculum}"
     if not settings.reset_free:
@@ -93,7 +91,7 @@ def _require_one_replay(settings: Settings, agent: Any) -> None:
 def _require_repeatable(trials: int, agent: Agent) -> None:
     """Refuse an agent that takes what follows a step for a state of the same episode."""
     follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
-    if isinstance(agent.experience, Replay) and agent.experience.hindsight:
+    if agent.experience.hindsight:
         raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
     if not isinstance(agent, BaseAgent):
         return

@@ -21,18 +21,45 @@ from mtjax.tasks import draw_at, episode_task
 from mtjax.types import Array, InputError, Key, Returning, Task
 
 
-@dataclasses.dataclass(frozen=True)
-class Everything:
-    """All tasks are played, always."""
+class Curriculum(abc.ABC):
+    """Says which tasks are played, and in worlds that are not reset what follows what."""
 
-    steps: ClassVar[int] = 0  # of every environment, after which tasks change; 0 for never
+    steps: Any = 0  # of every environment, after which tasks change; 0 for never
+    in_turn: ClassVar[bool] = False  # whether one task is played after another, for so many steps each
+    returns: ClassVar[bool] = False  # whether worlds go back to where they began, which they must not be reset for
 
+    @abc.abstractmethod
     def count(self, known: int) -> int:
         """Return the number T of tasks that are played at a time, of N that are known."""
+
+    @abc.abstractmethod
+    def rows(self, step: Array, known: int) -> Array:
+        """Return the numbers (T,) int32 of the tasks that are played from a step () of every environment on."""
+
+    def heard(self, known: int) -> Array | None:
+        """Return what was heard (N, 2) of tasks before any episode has ended; None if nothing is ever heeded."""
+        return None
+
+    def next_rows(self, step: Array, chunk: int, rows: Array, heard: Any, known: int) -> Array:
+        """Return the tasks (T,) of a chunk of so many steps that begins at a step (), after those of ``rows``."""
+        return self.rows(step, known)
+
+    def follow(self, env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
+        """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``.
+
+        By default it is any draw, wherever the world is.
+        """
+        return episode_task(listed, key)
+
+
+@dataclasses.dataclass(frozen=True)
+class Everything(Curriculum):
+    """All tasks are played, always."""
+
+    def count(self, known: int) -> int:
         return known
 
     def rows(self, step: Array, known: int) -> Array:
-        """Return the numbers (T,) int32 of the tasks that are played from a step () of every environment on."""
         return jnp.arange(known, dtype=jnp.int32)
 
 
@@ -43,8 +70,9 @@ class ForwardBackward(Everything):
     Han, Levine and Abbeel 2015, "Learning compound multi-step controllers under unknown dynamics"; EARL's FBRL.
     """
 
+    returns = True
+
     def follow(self, env: Returning, listed: Task, task: Task, state: Any, key: Key) -> Task:
-        """Return the task that one world plays next, of the draws of ``listed``, after ``task``, in ``state``."""
         back = env.returning(task)
         same = jax.tree.map(lambda x, y: jnp.all(x == y), back.goal, task.goal)
         came_back = jnp.all(jnp.stack(jax.tree.leaves(same)))
@@ -60,6 +88,8 @@ class Graph(Everything):
     one, and a world that is at none towards the nearest. Gupta et al. give edges by hand.
     """
 
+    returns = True
+
     def follow(self, env: Returning, listed: Task, task: Task, state: Any, key: Key) -> Task:
         draws = jax.vmap(draw_at, (None, 0))(listed, jnp.arange(len(listed.draws.id)))
         nodes = jax.tree.map(lambda x, y: jnp.append(x, y[None], axis=0), draws, env.returning(task))
@@ -71,7 +101,7 @@ class Graph(Everything):
 
 
 @dataclasses.dataclass(frozen=True)
-class Random:
+class Random(Curriculum):
     """Some tasks are played, and others drawn after so many steps of every environment, without repeating one."""
 
     played: int
@@ -90,12 +120,13 @@ class Random:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sequence:
+class Sequence(Curriculum):
     """One task is played after another, in the order of the table, for so many steps of every environment each.
 
     After the last one the first follows again.
     """
 
+    in_turn = True
     steps: int
 
     def count(self, known: int) -> int:
@@ -121,7 +152,7 @@ def _key(number: Array) -> Key:
 
 
 @dataclasses.dataclass(frozen=True)
-class Heeding:
+class Heeding(Curriculum):
     """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
 
     Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
@@ -134,7 +165,14 @@ class Heeding:
     count = Random.count
 
     def rows(self, step: Array, known: int) -> Array:
-        return self.choose(step, nothing_heard(known))
+        return self.choose(step, self.heard(known))
+
+    def heard(self, known: int) -> Array:
+        return jnp.full((known, 2), jnp.nan)
+
+    def next_rows(self, step: Array, chunk: int, rows: Array, heard: Array, known: int) -> Array:
+        due = step % self.steps < chunk  # also if a resumed run begins its chunks elsewhere
+        return jnp.where(due, self.choose(step, heard), rows)
 
     @abc.abstractmethod
     def choose(self, step: Array, heard: Array) -> Array:
@@ -202,21 +240,6 @@ _RANDOM = 0.1  # share of the choices
 _RATES = (0.5, 0.1)  # of the fast and of the slow mean
 
 
-def follow(plays: "Curriculum", env: Any, listed: Task, task: Task, state: Any, key: Key) -> Task:
-    """Return the task that one world plays next if it is not reset, after ``task``, in ``state``.
-
-    It is a draw of ``listed`` wherever the world is, unless the curriculum says more.
-    """
-    if isinstance(plays, ForwardBackward | Graph):
-        return plays.follow(env, listed, task, state, key)
-    return episode_task(listed, key)
-
-
-def nothing_heard(known: int) -> Array:
-    """Return what was heard (N, 2) of tasks before any episode has ended."""
-    return jnp.full((known, 2), jnp.nan)
-
-
 def hear(heard: Array, rows: Array, returns: Array) -> Array:
     """Return what was heard (N, 2) after a chunk with returns (S, T) of the tasks (T,) that were played.
 
@@ -228,7 +251,6 @@ def hear(heard: Array, rows: Array, returns: Array) -> Array:
 
 
 EVERYTHING = Everything()
-Curriculum = Everything | Random | Heeding | Sequence
 _OF_ALL = {"all": EVERYTHING, "forward-backward": ForwardBackward(), "graph": Graph()}
 _KINDS = {  # with how many numbers each has
     "random": (Random, 2),

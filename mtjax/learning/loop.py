@@ -143,7 +143,7 @@ def init(
         iteration=jnp.int32(0),
         key=key,
         rows=rows,
-        heard=curricula.nothing_heard(len(known.id)) if isinstance(settings.plays, curricula.Heeding) else None,
+        heard=settings.plays.heard(len(known.id)),
     )
 
 
@@ -235,7 +235,8 @@ def rows_of(tasks: Task, rows: Any) -> Task:
 
 def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> TrainState:
     """Begin the tasks that the curriculum plays from here on. If they are others, worlds and experience begin anew."""
-    rows, shape = _next_rows(settings, state, len(known.id)), state.total.shape
+    chunk = state.iteration, settings.chunk_steps
+    rows, shape = settings.plays.next_rows(*chunk, state.rows, state.heard, len(known.id)), state.total.shape
 
     def begin(state: TrainState) -> TrainState:
         tasks = rows_of(known, rows)
@@ -250,15 +251,6 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
         return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
 
     return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
-
-
-def _next_rows(settings: Settings, state: TrainState, known: int) -> Array:
-    """Return the numbers (T,) of the tasks that are played from here on."""
-    plays = settings.plays
-    if not isinstance(plays, curricula.Heeding):
-        return plays.rows(state.iteration, known)
-    due = state.iteration % plays.steps < settings.chunk_steps  # also if a resumed run begins its chunks elsewhere
-    return jnp.where(due, plays.choose(state.iteration, state.heard), state.rows)
 
 
 def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state: TrainState) -> Any:

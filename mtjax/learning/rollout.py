@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.swept import at_point, numbers_of
-from mtjax.learning import curricula
 from mtjax.learning.trials import EACH_EPISODE, Ends, Trials
 from mtjax.parallel import collectives
 from mtjax.parallel.axes import over_learners, renew_worlds, where_worlds
@@ -273,7 +272,7 @@ def _change_tasks(env: Lasting, tasks: Task, worlds: Worlds, ends: Ends, keys: K
     begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
     if tasks.draws is None:
         return begun
-    of_task = jax.vmap(partial(curricula.follow, trials.plays, env), (None, 0, 0, 0))  # type: ignore
+    of_task = jax.vmap(partial(trials.plays.follow, env), (None, 0, 0, 0))  # type: ignore
     follow = jax.vmap(jax.vmap(of_task), (None, 0, 0, 0))
     following = follow(tasks, worlds.task, begun.state, keys)  # type: ignore
     goes_on = ends.trial & ~lost
