@@ -6,6 +6,7 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
@@ -327,6 +328,10 @@ class Experience(Protocol):
     storage: ClassVar[Storage]
 
     @property
+    def batch_size(self) -> int: ...  # transitions of each task in an update; 0: a share of those collected
+    @property
+    def sized_by(self) -> Sequence[str]: ...  # flags that say how much data it holds
+    @property
     def hindsight(self) -> float: ...  # the share of what is learned from that is relabelled as another task's
     @property
     def steps(self) -> int: ...  # of every environment that are collected before the agent learns
@@ -355,6 +360,7 @@ class Experience(Protocol):
 class Agent(Protocol):
     """An agent acts and learns. It is a frozen dataclass; its fields are hyper-parameters and command-line flags."""
 
+    lr_schedule: Any  # how learning rates change over a run, "constant" if they do not
     continual: ClassVar[Any]  # the part that remembers tasks learned one after another: ``agents.parts.remembering``
     plasticity: ClassVar[Any]  # the part that keeps networks able to learn: ``agents.parts.plasticity``
     goes_on: ClassVar[bool]  # whether its memory holds an option that runs, ``memory.running.option``

@@ -226,8 +226,10 @@ class BaseAgent(abc.ABC):
     @property
     def unroll(self) -> int:
         """Steps of the windows through which a memory learns, with burn-in, of a rollout all; 0 if none does."""
+        if not self.conditioning.recurs:
+            return 0
         way: Any = self.conditioning
-        return getattr(self.experience, "unroll", way.burn_in + way.recurrent_steps) if way.recurs else 0
+        return way.burn_in + way.recurrent_steps if self.experience.storage.kept else self.experience.steps
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state for the training ``tasks`` (T, ...)."""

@@ -130,7 +130,7 @@ def _begun(start: Any, agent: Any) -> Policy | tuple[Policy, ...] | None:
     several = isinstance(start, list | tuple)
     found = tuple(x if isinstance(x, Policy) else load(path(x, "start")) for x in (start if several else [start]))
     learner = preset_of(agent).cls if isinstance(agent, str) else agent or (found and found[0].agent)
-    if getattr(learner, "taught", False) and found:
+    if found and learner.taught:  # type: ignore
         return found
     if several:
         raise InputError("start is one policy, or for agent='distil' a list of those that teach it")

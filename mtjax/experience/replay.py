@@ -142,6 +142,11 @@ class Replay:
         """Steps of every environment before the agent learns again."""
         return self.update_every
 
+    @property
+    def sized_by(self) -> tuple[str, ...]:
+        """Flags that say how much data it holds."""
+        return "replay-size", *["host-replay-size"] * bool(self.host_replay_size)
+
     def capacity(self, num_envs: int) -> int:
         """Return how many transitions each task's ring holds: the replay size, rounded down to whole iterations."""
         stored = self.steps * num_envs

@@ -348,7 +348,7 @@ def _with_first(steps: Transition, begun: Any) -> Transition:
 
     Otherwise a memory of many numbers would be stored at every step.
     """
-    if getattr(begun, "hidden", None) is None:
+    if begun.hidden is None:
         return steps
     hidden = jax.tree.map(lambda x: x[:, :, None], begun.hidden)
     return steps._replace(memory=steps.memory._replace(hidden=hidden))

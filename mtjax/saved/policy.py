@@ -243,7 +243,7 @@ def policy_of(
         agent = swept.agent_at(agent, latest if member else found[seed // count])
         states = states._replace(numbers={})
     rows = slice(seed, seed + 1) if member else _point_rows(count, seed)
-    if getattr(agent, "taught", False):
+    if agent.taught:
         agent, states = leave(agent, states)
     own, seeds = (0, seeds[seed % count][None]) if member else (seed % count, seeds)
     states = _rows(states, np.arange(len(jax.tree.leaves(states)[0]))[rows])

@@ -128,7 +128,7 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
 def _sizes(config: RunConfig) -> str:
     """Return a line on how many worlds and transitions of a batch a task has, and all tasks together."""
     count, experience = config.played_tasks, config.learner.experience
-    sizes = {"worlds": config.training.num_envs, "transitions in a batch": getattr(experience, "batch_size", 0)}
+    sizes = {"worlds": config.training.num_envs, "transitions in a batch": experience.batch_size}
     told = lambda size: f"{size:,}" if count == 1 else f"{size:,} a task, {count * size:,} in all"
     return "; ".join(f"{name}: {told(size)}" for name, size in sizes.items() if size)
 

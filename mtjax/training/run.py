@@ -222,9 +222,7 @@ class _Run:
         if line := meshes.describe(self.config.mesh, len(self.seeds), settings.num_envs):
             self.console.say(line)
         if self.hooks.directory is not None:
-            larger = [name for name in ("replay_size", "host_replay_size") if getattr(self.agent.experience, name, 0)]
-            flags = [name.replace("_", "-") for name in larger or ["num_envs"]]
-            checkpoint.require_space(self.hooks.directory, shapes, needs.host, flags)
+            checkpoint.require_space(self.hooks.directory, shapes, needs.host, self.agent.experience.sized_by)
 
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""

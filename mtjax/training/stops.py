@@ -80,13 +80,11 @@ def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str
 
 
 def finite_seeds(state: Any) -> np.ndarray:
-    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite networks; (1,) if it names none."""
-    nets = getattr(state, "nets", None)
-    return hosts.gather(_finite_seeds(nets)) if nets else np.ones(1, bool)
+    """Return which seeds (S,) of an agent's state, leaves (S, ...), have finite numbers only."""
+    return hosts.gather(_finite_seeds(state))
 
 
 @jax.jit
-def _finite_seeds(parameters: Any) -> Array:
-    """Return which seeds (S,) have finite parameters only; leaves (S, ...)."""
-    floats = [x for x in jax.tree.leaves(parameters) if jnp.issubdtype(x.dtype, jnp.floating)]
+def _finite_seeds(state: Any) -> Array:
+    floats = [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x).reshape(len(x), -1), axis=1) for x in floats]), axis=0)
