@@ -23,6 +23,7 @@ from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
+from mtjax.agents.parts.watching import Watcher
 from mtjax.agents.rates import discounts, discounts_of_all, scheduled
 from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.agents.view import View, init_inputs, join_arrays
@@ -315,7 +316,7 @@ class BaseAgent(abc.ABC):
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.view.count(state.nets["inputs"], steps.obs)}
         for name in WATCHERS:
-            part: Scaling | Sampler = getattr(self, name)
+            part: Watcher = getattr(self, name)
             after = told._replace(memory=part.remember(getattr(told.memory, name), told.reward, gamma))
             new[name] = Params({}, part.observe(state.nets[name].own, after))
         return state.with_nets(**new)

@@ -11,31 +11,13 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
+from mtjax.agents.parts.watching import Watcher
 from mtjax.types import Array, InputError, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class Uniform:
-    """Weighs all tasks equally. Every sampler is a class with these methods.
-
-    It may keep statistics of all steps, its memory, and something of each episode so far.
-    """
-
-    def init(self, num_tasks: int) -> Any:
-        """Return the memory before the first step; leaves are (T, ...)."""
-        return None
-
-    def begin(self) -> Any:
-        """Return what is kept of an episode as it begins; None for nothing."""
-        return None
-
-    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
-        """Return what is kept of an episode after a step."""
-        return episode
-
-    def observe(self, memory: Any, steps: Transition) -> Any:
-        """Update the memory by collected steps (T, N, ...), whose ``memory`` is what was kept after each step."""
-        return memory
+class Uniform(Watcher):
+    """Weighs all tasks equally. Every sampler is a class with these methods."""
 
     def weights(self, memory: Any, temperature: Array) -> Array | None:
         """Return the weights (T,) of the tasks' losses, of mean 1; None for all 1. ``temperature`` (T,) is SAC's."""

@@ -6,33 +6,15 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 
 from mtjax.agents.networks import Params
+from mtjax.agents.parts.watching import Watcher
 from mtjax.types import Array, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class NoScaling:
-    """Leaves rewards as they are. Every scaling is a class with these methods.
-
-    It may keep statistics of all steps, its memory, and something of each episode so far.
-    """
+class NoScaling(Watcher):
+    """Leaves rewards as they are. Every scaling is a class with these methods."""
 
     follows_resets: ClassVar[bool] = False  # whether its units are renewed by resets of networks alone
-
-    def init(self, num_tasks: int) -> Any:
-        """Return the memory before the first step; leaves are (T, ...)."""
-        return None
-
-    def begin(self) -> Any:
-        """Return what is kept of an episode as it begins; None for nothing."""
-        return None
-
-    def remember(self, episode: Any, reward: Array, gamma: float | Array) -> Any:
-        """Return what is kept of an episode after a step."""
-        return episode
-
-    def observe(self, memory: Any, steps: Transition) -> Any:
-        """Update the memory by collected steps (T, N, ...), whose ``memory`` is what was kept after each step."""
-        return memory
 
     def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:
         """Return each task's factor and offset (T,); None for 1 and 0.
