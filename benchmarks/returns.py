@@ -27,7 +27,7 @@ from parts import whole
 from report import markdown, record, run_main, write_lines
 from resumable import train
 
-from mtjax.agents.choices import replace
+from mtjax.agents.hyperparameters import replace
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
 from mtjax.envs.mixtures import FamilyOrMixture

@@ -24,7 +24,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 from mtjax import agents, envs
-from mtjax.agents.choices import PARTS, flag_names, kinds_of, settings
+from mtjax.agents.hyperparameters import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family

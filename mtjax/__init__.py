@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # for editors, which do not run __getattr__
     from mtjax.envs.hosted.gymnasium import hosted as hosted
     from mtjax.learning.loop import Settings as Settings
     from mtjax.names import InputError as InputError
-    from mtjax.report.collect import runs as runs
     from mtjax.report.drawing import plot as plot
+    from mtjax.report.read_runs import runs as runs
     from mtjax.report.scoring import evaluate as evaluate
     from mtjax.saved import standalone as standalone
     from mtjax.saved.export import export as export
@@ -55,7 +55,7 @@ _HOME = {
     "pull": "mtjax.saved.hub",
     "push": "mtjax.saved.hub",
     "register": "mtjax.command.register",
-    "runs": "mtjax.report.collect",
+    "runs": "mtjax.report.read_runs",
     "stacked": "mtjax.envs",
     "train": "mtjax.command.api",
 }

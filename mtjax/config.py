@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from mtjax.agents import BaseAgent, agent, preset_of, settings, tuned_as
 from mtjax.agents import name_of as agent_name_of
-from mtjax.agents.choices import kinds_of, replace, require_value_range
+from mtjax.agents.hyperparameters import kinds_of, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.swept import agents_at
 from mtjax.agents.teacher import Teacher

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 
 from mtjax.checks import require_episodes, require_run
-from mtjax.command import imports, parsing, process, refusals, words
+from mtjax.command import flags, imports, parsing, process, refusals
 from mtjax.names import SPLITS, InputError, become, command, load, nearest_error
 from mtjax.saved import pretrained
 
@@ -65,7 +65,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     """Return the request, and the values of --env.vary.NAME=VALUES by name."""
     if argv and not argv[0].startswith("-"):
         raise InputError(f"say which run to evaluate by --run={argv[0]}")
-    vary, argv = words.vary_flags(imports.import_files(words.with_port(argv)))
+    vary, argv = flags.vary_flags(imports.import_files(flags.with_port(argv)))
     refusals.check_flags_of(Request, argv)
     request = parsing.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
     if not request.run:

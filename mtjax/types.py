@@ -361,7 +361,7 @@ class Agent(Protocol):
     """An agent acts and learns. It is a frozen dataclass; its fields are hyper-parameters and command-line flags."""
 
     lr_schedule: Any  # how learning rates change over a run, "constant" if they do not
-    continual: ClassVar[Any]  # the part that remembers tasks learned one after another: ``agents.parts.remembering``
+    continual: ClassVar[Any]  # the part that remembers tasks learned one after another: ``agents.parts.continual``
     plasticity: ClassVar[Any]  # the part that keeps networks able to learn: ``agents.parts.plasticity``
     goes_on: ClassVar[bool]  # whether its memory holds an option that runs, ``memory.running.option``
     taught: ClassVar[bool]  # whether it learns from the policies of other runs

@@ -12,14 +12,14 @@ import pytest
 from needs import needs
 
 from mtjax import agents
-from mtjax.agents import replayed
+from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.adaptation import adapt
+from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.plasticity import Plasticity
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.agents.parts.remembering import Continual
 from mtjax.command.keywords import configured
 from mtjax.config import Plan, configure
 from mtjax.envs import ENVS, Family, Parameter
@@ -318,7 +318,7 @@ def update(agent, state, batch: Transition, tasks: Task, key, number=0):
 
 def prepare(agent, state, batch: Transition, tasks: Task):
     """What an agent's losses take of transitions (T, B, ...)."""
-    return replayed.prepare(agent, state, windows(batch), tasks)
+    return replay_batches.prepare(agent, state, windows(batch), tasks)
 
 
 def assessed(agent, state, steps: Transition, tasks: Task):

@@ -19,7 +19,7 @@ from mtjax.config import Plan, with_preset
 from mtjax.envs.family import Family
 from mtjax.learning.loop import Settings
 from mtjax.names import in_python
-from mtjax.report import collect, curve
+from mtjax.report import curve, read_runs
 from mtjax.saved.config_json import from_json
 from mtjax.training import memory
 from mtjax.types import InputError
@@ -401,7 +401,7 @@ TAKERS = {
     "settings": lambda x: mtjax.train("bandit", "sac", settings=x, steps=1),
     "batch-size": lambda x: mtjax.train("bandit", "sac", batch_size=x, steps=1),
     "file": lambda x: mtjax.export(None, x),
-    "runs to draw": collect.read,
+    "runs to draw": read_runs.read,
     "split of tasks": lambda x: mtjax.make("bandit").tasks(x),
 }
 

@@ -15,7 +15,7 @@ import pytest
 from probes import with_nets
 
 import mtjax.train
-from mtjax.agents.choices import replace
+from mtjax.agents.hyperparameters import replace
 from mtjax.learning import loop
 from mtjax.names import Notice
 from mtjax.saved import arrays, checkpoint

@@ -23,7 +23,7 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
-from mtjax.agents.choices import CHOICES
+from mtjax.agents.hyperparameters import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
 from mtjax.command import flag_files, process, run_config
 from mtjax.command.run_config import parse

@@ -6,8 +6,8 @@ import numpy as np
 import optax
 import pytest
 
-from mtjax.agents.parts import continual
-from mtjax.agents.parts.continual import FREE, anchor, penalty
+from mtjax.agents.parts import forgetting
+from mtjax.agents.parts.forgetting import FREE, anchor, penalty
 
 RANDOM = np.random.default_rng(0)
 CURVATURES, OPTIMA = np.float32(RANDOM.uniform(0.5, 3, (3, 4))), np.float32(RANDOM.normal(size=(3, 4)))
@@ -48,7 +48,7 @@ def test_tasks_one_after_another_are_learned_as_all_at_once():
 def test_all_parameters_are_equally_important_to_l2():
     """The penalty is c / 2 |theta - anchor|^2, and 0 at the anchor."""
     params = {"w": jnp.array([[1.0, 2.0]]), "b": jnp.array([3.0])}
-    held = anchor(params, continual.l2(params))
+    held = anchor(params, forgetting.l2(params))
     moved = jax.tree.map(lambda x: x + 2, params)
     assert float(penalty(held, moved, 0.5)) == 0.25 * 3 * 4 and float(penalty(held, params, 0.5)) == 0
 
@@ -58,7 +58,7 @@ def test_the_importance_of_a_gaussian_policy():
     x, params = np.float32([1.0, -2.0, 0.5]), {"w": jnp.float32(0.3), "s": jnp.float32(0.4)}
     outputs = lambda params, x: jnp.stack([params["w"] * x, params["s"]])
     information = lambda outputs: jnp.stack([1 / outputs[1] ** 2, 2 / outputs[1] ** 2])
-    found = continual.ewc(outputs, information, params, x)
+    found = forgetting.ewc(outputs, information, params, x)
     assert float(found["w"]) == pytest.approx(np.mean(x**2) / 0.4**2, rel=1e-5)
     assert float(found["s"]) == pytest.approx(2 / 0.4**2, rel=1e-5)
 
@@ -67,7 +67,7 @@ def test_the_importance_is_the_curvature_of_the_divergence():
     """Of log-probabilities, which weigh pi: the diagonal of the second derivative of KL(pi | pi_theta) at pi."""
     x, params = np.float32(RANDOM.normal(size=(5, 2))), {"w": jnp.float32(RANDOM.normal(size=(2, 3)))}
     outputs = lambda params, x: jax.nn.log_softmax(x @ params["w"])
-    found = continual.ewc(outputs, jnp.exp, params, x)
+    found = forgetting.ewc(outputs, jnp.exp, params, x)
 
     def divergence(flat):
         one = lambda x: jnp.exp(outputs(params, x)) @ (outputs(params, x) - outputs({"w": flat.reshape(2, 3)}, x))
@@ -81,7 +81,7 @@ def test_the_importance_is_the_curvature_of_the_divergence():
 def test_the_importance_of_a_linear_network_to_mas(x):
     """|d (w x)^2 / dw| = 2 |w| x^2, averaged over inputs."""
     x, params = np.float32(x), {"w": jnp.float32(-0.3)}
-    found = continual.mas(lambda params, x: (params["w"] * x)[None], params, x)
+    found = forgetting.mas(lambda params, x: (params["w"] * x)[None], params, x)
     assert float(found["w"]) == pytest.approx(2 * 0.3 * np.mean(x**2), rel=1e-5)
 
 
@@ -116,8 +116,8 @@ def learn(params, owners, owner, x, y, seen, steps=300):
 def learn_pruned(params, owners, task, share, x, y):
     """Learn a task with the free weights, keep a share of them, and go on with these."""
     params = jax.jit(lambda params: learn(params, owners, FREE, x, y, lambda params: params))(params)
-    params, owners = continual.prune(params, owners, task, share)
-    seen = lambda params: continual.seen_by(params, owners, task)
+    params, owners = forgetting.prune(params, owners, task, share)
+    seen = lambda params: forgetting.seen_by(params, owners, task)
     return jax.jit(lambda params: learn(params, owners, task, x, y, seen))(params), owners
 
 
@@ -126,8 +126,8 @@ def test_later_tasks_change_nothing_of_earlier_ones_to_the_bit():
     x = jnp.float32(RANDOM.normal(size=(40, 2)))
     tasks = [jnp.sin(2 * x[:, 0]), x[:, 1], jnp.abs(x[:, 0])]
     params, then = blank(), []
-    owners = continual.unowned(params)
-    outputs = jax.jit(lambda params, owners, task: network(continual.seen_by(params, owners, task), x))
+    owners = forgetting.unowned(params)
+    outputs = jax.jit(lambda params, owners, task: network(forgetting.seen_by(params, owners, task), x))
     for i, y in enumerate(tasks, 1):
         params, owners = learn_pruned(params, owners, i, 1 / (4 - i), x, y)
         then.append((np.asarray(outputs(params, owners, i)), y))
@@ -140,14 +140,14 @@ def test_later_tasks_change_nothing_of_earlier_ones_to_the_bit():
 def test_a_task_keeps_the_largest_of_its_free_weights():
     """The others become 0 and stay free; vectors are the first task's."""
     params = {"kernel": jnp.array([[5.0, -4.0, 3.0], [-2.0, 1.0, 0.0]]), "bias": jnp.array([0.1])}
-    params, owners = continual.prune(params, continual.unowned(params), 1, 1 / 3)
+    params, owners = forgetting.prune(params, forgetting.unowned(params), 1, 1 / 3)
     np.testing.assert_array_equal(owners["kernel"], [[1, 1, 0], [0, 0, 0]])
     np.testing.assert_array_equal(params["kernel"], [[5, -4, 0], [0, 0, 0]])
     assert owners["bias"] == 1
     params = {"kernel": params["kernel"].at[1].set(jnp.array([7.0, 8.0, -9.0])), "bias": params["bias"]}
-    params, owners = continual.prune(params, owners, 2, 1 / 2)
+    params, owners = forgetting.prune(params, owners, 2, 1 / 2)
     np.testing.assert_array_equal(owners["kernel"], [[1, 1, 0], [0, 2, 2]])
     np.testing.assert_array_equal(params["kernel"], [[5, -4, 0], [0, 8, -9]])
-    first = continual.seen_by(params, owners, 1)
+    first = forgetting.seen_by(params, owners, 1)
     np.testing.assert_array_equal(first["kernel"], [[5, -4, 0], [0, 0, 0]])
     assert owners["bias"] == 1 and float(first["bias"][0]) == pytest.approx(0.1)

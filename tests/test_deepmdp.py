@@ -28,7 +28,7 @@ from probes import act as act_once
 from probes import values as values_of
 
 from mtjax import agents
-from mtjax.agents import replayed
+from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.fit import learned
 from mtjax.agents.networks import Params
@@ -36,8 +36,8 @@ from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
-from mtjax.agents.replayed import Batch, slow_copies
-from mtjax.agents.unseen import describe_unseen
+from mtjax.agents.replay_batches import Batch, slow_copies
+from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.experience.rollouts import windows
 from mtjax.types import InputError, Spec, Transition
 
@@ -245,7 +245,7 @@ def test_a_rival_is_always_another_task():
     agent = make("hip-bmdp")
     state, batch, _ = start(agent)
     seen = probes.prepare(agent, state, batch, TASKS)
-    rivals = jit(lambda key: replayed.critic_data(agent, state, seen, key)[0].model_targets.other_theta)
+    rivals = jit(lambda key: replay_batches.critic_data(agent, state, seen, key)[0].model_targets.other_theta)
     thetas, turns = np.asarray(state.nets["representation"].own["embedding"]), set()
     for seed in range(12):
         found = np.asarray(rivals(jax.random.key(seed)))
@@ -255,7 +255,7 @@ def test_a_rival_is_always_another_task():
     first = lambda tree: jax.tree.map(lambda x: x[:1], tree)
     alone = lambda nets: {name: Params(net.shared, first(net.own)) for name, net in nets.items()}
     state = state._replace(nets=alone(state.nets), slow=alone(state.slow))
-    data = pick(replayed.critic_data(agent, state, first(seen), KEY), 0)
+    data = pick(replay_batches.critic_data(agent, state, first(seen), KEY), 0)
     theta_loss = lambda nets: agent.critic_loss(nets, *data)[1].metrics["theta_loss"]
     value, slope = jit(jax.value_and_grad(theta_loss))(of_critics(of_task(state.nets, 0)))
     np.testing.assert_allclose(value, 0, atol=1e-10)

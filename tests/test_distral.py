@@ -17,10 +17,10 @@ from mtjax.agents.distral import Distral
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.agents.replayed import Batch
+from mtjax.agents.replay_batches import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import axes_of
-from mtjax.agents.unseen import describe_unseen
+from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4

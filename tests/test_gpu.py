@@ -29,7 +29,7 @@ from test_rocking import ROCKING, tilting
 import mtjax
 from mtjax.agents import AGENTS, for_action, options
 from mtjax.agents.base import Memory
-from mtjax.agents.choices import replace
+from mtjax.agents.hyperparameters import replace
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.parts.values import C51

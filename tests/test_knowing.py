@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from probes import SPEC, learner, of_task, pick, random_batch, tasks_of, tiny
 
-from mtjax.agents import PARTS, replayed
+from mtjax.agents import PARTS, replay_batches
 from mtjax.agents.parts.knowing import CONDITIONINGS, Embedding
 from mtjax.agents.view import init_inputs
 from mtjax.types import InputError
@@ -103,7 +103,7 @@ def test_slow_vectors_follow_at_the_critics_rate():
     made = tiny("hip-bmdp", conditioning="embedding")
     state = made.init(SPEC, TASKS, KEY)
     more = lambda nets: {name: jax.tree.map(lambda x: x + 1, nets[name]) for name in ("knowing", "representation")}
-    after = replayed.update_target(made, state._replace(nets=state.nets | more(state.nets)))
+    after = replay_batches.update_target(made, state._replace(nets=state.nets | more(state.nets)))
     step = lambda net: after.slow[net].own["embedding"] - state.slow[net].own["embedding"]
     np.testing.assert_allclose(step("knowing"), made.tau, rtol=1e-3)
     np.testing.assert_allclose(step("representation"), made.representation.encoder_tau, rtol=1e-3)

@@ -9,7 +9,7 @@ import pytest
 from probes import Walk, adapted_gain, of_task, only_seed, pick, tiny, train, with_nets
 
 import mtjax
-from mtjax.agents import agent, clipped, for_action
+from mtjax.agents import agent, clipped_ratio, for_action
 from mtjax.agents.maml import MAML
 from mtjax.agents.on_policy import Taken
 from mtjax.envs.probes import Probe, World, tasks_of
@@ -106,7 +106,7 @@ def test_advantages_end_with_their_rollout():
     no = jnp.zeros((2, 6, 4), bool)
     steps = Transition(None, reward, reward, jnp.ones((2, 6, 4)), None, no, no, no)
     of = lambda part: [jax.tree.map(lambda x: x[:, part], x) for x in (steps, value, following)]
-    find = lambda part: clipped.advantages(made, of(part)[0], TASKS, *of(part)[1:], made.experience.apart)[1]
+    find = lambda part: clipped_ratio.advantages(made, of(part)[0], TASKS, *of(part)[1:], made.experience.apart)[1]
     apart = jnp.concatenate([find(slice(3)), find(slice(3, 6))], axis=1)
     np.testing.assert_allclose(find(slice(None)), apart, rtol=1e-5, atol=1e-6)
     assert jnp.mean(apart[:, :3], axis=(1, 2)) == pytest.approx(0, abs=1e-6)

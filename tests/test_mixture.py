@@ -22,7 +22,7 @@ from mtjax.agents import for_action, normalize
 from mtjax.agents.networks import OVER_TASKS, Params
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.rates import discounts
-from mtjax.agents.replayed import Batch, action_sizes
+from mtjax.agents.replay_batches import Batch, action_sizes
 from mtjax.agents.state import AgentState
 from mtjax.agents.view import init_inputs
 from mtjax.command import run_config

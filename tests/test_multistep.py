@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from probes import Goals, Stub, Walk, one_in, pick, quick, random_batch, random_past, tasks_of, tiny, train, with_nets
 
-from mtjax.agents import replayed
+from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.last_steps import append
@@ -160,8 +160,8 @@ def test_each_task_has_its_own_discount():
     tasks = tasks_of("one-step")._replace(horizon=jnp.int32([125, 250]))
     agent, steps = tiny("sac-conditioned", discounting="horizon", experience=Replay(n_step=3)), windows(2)
     state = agent.init(SPEC, tasks, jax.random.key(0))
-    joined = replayed.transitions(agent, steps, tasks)
-    batch = quick(partial(replayed.prepare, agent), state, steps, tasks)(state, steps, tasks)
+    joined = replay_batches.transitions(agent, steps, tasks)
+    batch = quick(partial(replay_batches.prepare, agent), state, steps, tasks)(state, steps, tasks)
     for task, gamma in enumerate((0.96, 0.98)):
         each = [multistep.join(pick(steps, (task, b)), gamma) for b in range(4)]
         np.testing.assert_allclose(joined.reward[task], [x.reward for x in each], rtol=1e-6)
@@ -196,7 +196,7 @@ def test_units_of_a_task_scale_joined_rewards_as_its_values():
     mean, std = jnp.float32([3.0, -2.0]), jnp.float32([0.5, 4.0])
     scales = state.nets["scaling"].own._replace(mean=mean, variance=std**2)
     state = with_nets(state, scaling=Params({}, scales))
-    joined, batch = replayed.transitions(agent, steps, tasks), replayed.prepare(agent, state, steps, tasks)
+    joined, batch = replay_batches.transitions(agent, steps, tasks), replay_batches.prepare(agent, state, steps, tasks)
     value = 7.0
     target = batch.reward + batch.discount * (value - mean[:, None]) / std[:, None]
     expected = (joined.reward + batch.discount * value - mean[:, None]) / std[:, None]
@@ -209,7 +209,7 @@ def test_the_past_at_the_bootstrap_is_that_of_the_windows_last_step():
     tasks, steps = tasks_of("one-step"), windows(2)
     steps = steps._replace(memory=Memory(random_past(np.random.default_rng(0), (2, 4, 3, 2), SPEC)))
     state = agent.init(SPEC, tasks, jax.random.key(0))
-    batch = quick(partial(replayed.prepare, agent), state, steps, tasks)(state, steps, tasks)
+    batch = quick(partial(replay_batches.prepare, agent), state, steps, tasks)(state, steps, tasks)
     for task, b in np.ndindex(2, 4):
         final = next((k for k in range(3) if steps.ended[task, b, k]), 2)
         last = pick(steps, (task, b, final))

@@ -11,7 +11,7 @@ import mtjax
 import mtjax.plot
 from mtjax import report
 from mtjax.learning.evaluation import Evaluations, save_evaluations
-from mtjax.report import collect, plots
+from mtjax.report import plots, read_runs
 from mtjax.report.stats import iqm, probability_of_improvement, seed_interval
 from mtjax.saved.config_json import to_json
 from mtjax.types import SPLITS, InputError
@@ -26,7 +26,7 @@ def make_run(tmp_path):
     def make_run(name, env, agent, seed=0, seeds=3, shift=0.0, **given):
         config = mtjax.preset(env, agent)
         plan = dataclasses.replace(config.plan, seed=seed, seeds=seeds, eval_episodes=2)
-        learner = mtjax.agents.choices.replace(config.learner, given)
+        learner = mtjax.agents.hyperparameters.replace(config.learner, given)
         config = dataclasses.replace(config, plan=plan, learner=learner)
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
@@ -58,7 +58,7 @@ def test_seeds_of_equal_settings_are_joined_and_others_are_named_apart(runs, mak
     """A seed that two runs share counts once."""
     make_run("e", "finger-spin-vary-size", "sac", gamma=0.5)
     make_run("f", "finger-spin-vary-size", "care", seed=2, seeds=2, shift=50)
-    found = {(one.env, one.agent): one for one in collect.learned(runs)}
+    found = {(one.env, one.agent): one for one in read_runs.learned(runs)}
     assert {agent: one.seeds for (env, agent), one in found.items() if env.startswith("finger")} == {
         "sac, gamma 0.99": (0, 1, 2, 3, 4),
         "sac, gamma 0.5": (0, 1, 2),
@@ -66,7 +66,7 @@ def test_seeds_of_equal_settings_are_joined_and_others_are_named_apart(runs, mak
     }
     one = found["finger-spin-vary-size", "sac, gamma 0.99"]
     assert one.returns["train"].shape == (5, 3, 10, 2) and one.axis == ("size", "1")
-    parts = [collect.learned(tmp_path / "runs" / name)[0] for name in ("a1", "a2")]
+    parts = [read_runs.learned(tmp_path / "runs" / name)[0] for name in ("a1", "a2")]
     joined = np.concatenate([part.returns["train"] for part in parts])
     np.testing.assert_array_equal(one.returns["train"], joined)
 
@@ -78,7 +78,7 @@ def test_learning_curves_are_means_with_bands(runs, tmp_path):
     folders = [tmp_path / "runs" / name for name in ("a1", "b")]
     axes = report.learning_curves(folders)
     assert axes.get_legend_handles_labels()[1] == ["sac (3 seeds)", "care (3 seeds)"]
-    found = collect.learned(folders)
+    found = read_runs.learned(folders)
     np.testing.assert_allclose(axes.lines[1].get_ydata(), found[1].returns["train"].mean(axis=(0, 2, 3)))
     assert len(axes.collections) == 2
     grid = report.families(runs)
@@ -97,7 +97,7 @@ def test_given_axes_are_drawn_on(runs, tmp_path):
 def test_returns_lie_over_the_parameter_in_order(runs, tmp_path):
     """Of all splits, with the training range shaded."""
     axes = report.return_by_parameter(tmp_path / "runs" / "a1")
-    (one,) = collect.learned(tmp_path / "runs" / "a1")
+    (one,) = read_runs.learned(tmp_path / "runs" / "a1")
     values = np.sort(np.concatenate([one.values[split] for split in SPLITS]))
     np.testing.assert_array_equal(axes.lines[0].get_xdata(), values)
     place = int(np.argmin(np.abs(values - one.values["interpolation"][2])))
@@ -137,7 +137,7 @@ def test_python_draws_what_the_command_draws(runs, tmp_path):
 
 def test_aggregates_are_those_of_all_tasks_of_all_families(runs, make_run):
     """Against the functions that compute them; an agent that lacks a family is refused."""
-    found = collect.learned(runs)
+    found = read_runs.learned(runs)
     scores = {}
     for agent in ("sac", "care"):
         own = [one.final() for one in found if one.agent == agent]
@@ -181,8 +181,8 @@ def test_all_figures_at_once(runs, tmp_path, capsys, monkeypatch):
 
 def test_a_metric_is_drawn_in_the_place_of_returns(runs, make_run, tmp_path, monkeypatch):
     """Of joined seeds too, with its own words; one that a run or a task does not have is refused."""
-    found = collect.of_metric(runs, "success")
-    for one, returned in zip(found, collect.learned(runs), strict=True):
+    found = read_runs.of_metric(runs, "success")
+    for one, returned in zip(found, read_runs.learned(runs), strict=True):
         np.testing.assert_array_equal(one.returns["train"], returned.returns["train"] > 50)
     axes = report.learning_curves([one for one in found if one.env.startswith("finger")])
     assert (
@@ -196,7 +196,7 @@ def test_a_metric_is_drawn_in_the_place_of_returns(runs, make_run, tmp_path, mon
         mtjax.plot.main([runs, "--metric=sucess"])
     scores = {"success": {split: np.full_like(x, np.nan) for split, x in found[0].returns.items()}}
     with pytest.raises(InputError, match="not all tasks of finger-spin-vary-size tell success"):
-        collect.of_metric([found[0]._replace(metrics=scores)], "success")
+        read_runs.of_metric([found[0]._replace(metrics=scores)], "success")
 
 
 def test_every_figure_has_a_name():
@@ -234,7 +234,7 @@ def test_runs_are_tables(runs, make_run):
     """A row for each seed, evaluation and task, with the task's parameter."""
     table = mtjax.runs(runs)
     assert list(table.columns[:8]) == ["run", "env", "agent", "seed", "steps", "split", "task", "size"]
-    (one,) = collect.learned(make_run("z", "finger-spin-vary-size", "film"))
+    (one,) = read_runs.learned(make_run("z", "finger-spin-vary-size", "film"))
     mine = mtjax.runs(runs.replace("*", "z"))
     row = mine[(mine.seed == 1) & (mine.steps == 200) & (mine.split == "extrapolation")].iloc[2]
     assert row["return"] == pytest.approx(one.returns["extrapolation"][1, 1, 2].mean())
@@ -286,9 +286,9 @@ def test_a_sweep_is_read_with_its_runs(make_run, tmp_path):
         record = json.loads((folder / "config.json").read_text())
         record["sweep"] = [f"agent.num-critics={critics}"]
         (folder / "config.json").write_text(json.dumps(record))
-    found = collect.read(tmp_path / "runs" / "s")
+    found = read_runs.read(tmp_path / "runs" / "s")
     assert [run.settings for run in found] == [{"num-critics": "2"}, {"num-critics": "3"}]
-    assert [one.agent for one in collect.learned(tmp_path / "runs" / "s")] == [
+    assert [one.agent for one in read_runs.learned(tmp_path / "runs" / "s")] == [
         "sac, num-critics 2",
         "sac, num-critics 3",
     ]
@@ -298,7 +298,7 @@ def test_a_sweep_is_read_with_its_runs(make_run, tmp_path):
 def test_a_folder_of_any_name_is_read(make_run, tmp_path, name, matched):
     """A folder goes before the pattern that its name would be."""
     folder, other = (make_run(f"{each}/run", "finger-spin-vary-size", "sac") for each in (name, "ab"))
-    of = lambda pattern: [found.directory for found in collect.read(pattern)]
+    of = lambda pattern: [found.directory for found in read_runs.read(pattern)]
     assert of(folder) == [folder] and of(other) == [other]
     with pytest.raises(InputError, match="its folders hold runs") as caught:
         of(folder.parent)

@@ -20,7 +20,7 @@ from mtjax.learning import loop, populations
 from mtjax.learning.evaluation import as_one_seed, no_evaluations
 from mtjax.learning.loop import Settings
 from mtjax.names import Notice
-from mtjax.report import collect
+from mtjax.report import read_runs
 from mtjax.saved.config_json import from_json
 from mtjax.training import selection
 from mtjax.training.run import _Progress, _Run
@@ -344,7 +344,7 @@ def test_a_population_is_one_seed_in_figures_and_tables(whole):
     """Its members' mean, and a line says why there is no interval."""
     for runs in (whole.directory, whole):
         with pytest.warns(Notice, match="8 members of a population .* have no intervals"):
-            (one,) = collect.learned(runs)
+            (one,) = read_runs.learned(runs)
         assert one.agent == "sac-conditioned, pbt:40" and one.seeds == (0,)
         mean = whole.evaluations.returns["train"].mean(axis=0)
         np.testing.assert_allclose(one.returns["train"], mean[None], rtol=1e-5)

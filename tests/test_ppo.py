@@ -25,7 +25,7 @@ from probes import (
 )
 
 from mtjax import agents
-from mtjax.agents import clipped, critics, normalize
+from mtjax.agents import clipped_ratio, critics, normalize
 from mtjax.agents.base import Memory
 from mtjax.agents.critics import Units
 from mtjax.agents.networks import OVER_TASKS
@@ -300,7 +300,7 @@ def test_steps_keep_their_contexts():
 @pytest.mark.parametrize("kind", ["none", "all", "task"])
 def test_advantages_are_brought_to_one_scale(kind):
     advantage = jnp.float32(np.random.default_rng(0).normal(size=(3, 50)) * [[1], [10], [100]] + 5)
-    found = clipped.normalized(kind, advantage.reshape(3, 10, 5)).reshape(3, 50)
+    found = clipped_ratio.normalized(kind, advantage.reshape(3, 10, 5)).reshape(3, 50)
     axis = {"none": (), "all": None, "task": 1}[kind]
     if kind == "none":
         np.testing.assert_array_equal(found, advantage)
@@ -310,7 +310,7 @@ def test_advantages_are_brought_to_one_scale(kind):
 
 
 def test_advantages_of_a_task_that_earns_nothing_are_nothing():
-    assert np.all(np.asarray(clipped.normalized("task", jnp.zeros((2, 5, 1)))) == 0)
+    assert np.all(np.asarray(clipped_ratio.normalized("task", jnp.zeros((2, 5, 1)))) == 0)
 
 
 @pytest.mark.parametrize("most", [0.0, 0.5])

@@ -12,7 +12,7 @@ from probes import Walk, of_task, pick, quick, slow_but, tasks_of, tiny, train
 
 import mtjax
 from mtjax import agents
-from mtjax.agents import replayed
+from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.recurrent import Following, Recurrent, Track
@@ -127,7 +127,7 @@ def test_sac_learns_from_windows_that_begin_with_the_stored_state():
     agent = tiny("sac", recurrent_steps=4, **RECURRENT)
     state = agent.init(SPEC, TASKS, KEY)
     steps = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2)[:, :, :4], rollout()._replace(extras=None))  # (T, B, L, ...)
-    batch = replayed.prepare(agent, state, steps, TASKS)
+    batch = replay_batches.prepare(agent, state, steps, TASKS)
     assert batch.reward.shape == (3, ENVS * 4)
     np.testing.assert_array_equal(batch.obs.past.state, steps.memory.hidden[:, :, 0])
     update = jax.jit(lambda steps: agent.update(state, steps, TASKS, KEY, jnp.int32(0))[1]["critic_loss"])
@@ -184,8 +184,8 @@ def test_after_burn_in_steps_are_learned_from_with_the_memory_of_present_paramet
     rest = rest_of(windows, burned(agent, nets["knowing"].parts, windows))
 
     def learn(agent, windows):
-        batch = agent.view.keyed(replayed.prepare(agent, state, windows, TASKS), KEY)
-        batch, target = replayed.critic_data(agent, state, batch, KEY)
+        batch = agent.view.keyed(replay_batches.prepare(agent, state, windows, TASKS), KEY)
+        batch, target = replay_batches.critic_data(agent, state, batch, KEY)
         one, of_one = jax.tree.map(lambda x: x[0], (batch, target))
         loss = lambda nets: (agent.critic_loss(nets, one, of_one)[0], agent.actor_loss(nets, one, KEY)[0])
         return loss(nets), jax.grad(lambda nets: sum(loss(nets)))(nets)
@@ -205,7 +205,7 @@ def test_targets_burn_in_with_slow_parameters():
     state = agent.init(SPEC, TASKS, KEY)
     slow = jax.tree.map(lambda x: 0.5 * x, state.nets["knowing"].shared)
     rest = rest_of(windows, burned(agent, slow, windows))
-    seen = [replayed.prepare(a, state, w, TASKS).next_obs for a, w in ((agent, windows), (plain, rest))]
+    seen = [replay_batches.prepare(a, state, w, TASKS).next_obs for a, w in ((agent, windows), (plain, rest))]
     features = lambda way, seen: jax.vmap(lambda seen: way.features(slow, jnp.zeros(0), seen))(seen)
     found, expected = (features(a.conditioning, x) for a, x in zip((agent, plain), seen, strict=True))
     assert found.shape == (3, ENVS * LEARNED, SIZE)

@@ -7,9 +7,9 @@ import pytest
 from probes import QUICK, Walk, configure, param, pick, prepare, random_batch, tiny
 
 import mtjax
-from mtjax.agents import consolidating
+from mtjax.agents import task_changes
 from mtjax.agents.networks import Params
-from mtjax.agents.parts import continual, put, remembering
+from mtjax.agents.parts import continual, forgetting, put
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.state import of_task
 from mtjax.command import run_config
@@ -124,12 +124,12 @@ def test_a_clone_holds_what_the_actor_put_out_where_each_task_ended():
 
 def test_the_penalty_is_a_part_of_the_actors_loss():
     """Of one parameter that lies 0.5 beside its anchor, at importance 3: 10 / 2 * 3 * 0.25."""
-    way = remembering.EWC(ewc_coefficient=10.0)
+    way = continual.EWC(ewc_coefficient=10.0)
     actor = Params({"w": jnp.array([1.0])}, {})
     nets = {"actor": actor} | way.init(actor, 2, (), 2)
     penalty = lambda nets: float(way.penalty(nets, None, jax.random.key(0)))
     assert penalty(nets) == 0
-    held = continual.Anchor({"w": jnp.array([0.5])}, {"w": jnp.array([3.0])})
+    held = forgetting.Anchor({"w": jnp.array([0.5])}, {"w": jnp.array([3.0])})
     assert penalty(nets | {"continual": Params({"anchor": held}, {})}) == pytest.approx(3.75)
     agent = tiny("sac-conditioned", continual="ewc")
     state = agent.init(Walk().spec, TASKS, jax.random.key(0))
@@ -146,7 +146,7 @@ def test_the_information_of_a_policy_is_that_of_its_gaussian():
     outputs = jnp.float32([0.3, -0.2, 0.1, -0.6])
     slope = 3.5 * (1 - np.tanh(outputs[2:]) ** 2)
     deviation = np.exp(-5 + 3.5 * (np.tanh(outputs[2:]) + 1))
-    found = consolidating.information(Gaussian(), None, outputs)
+    found = task_changes.information(Gaussian(), None, outputs)
     np.testing.assert_allclose(found, np.concatenate([deviation**-2.0, 2 * slope**2]), rtol=1e-4)
 
 
@@ -230,7 +230,7 @@ def test_a_command_switches_off_what_a_preset_has_and_packnet_refuses():
     """Before the settings of the preset are put together with PackNet."""
     words = ["--env=point-mass-vary-goal", "--agent=sac", "--agent.continual=packnet", "--curriculum=sequence:1000"]
     agent = run_config.parse([*words, "--agent.normalize-observations=false"]).learner
-    assert isinstance(agent.continual, remembering.PackNet) and not agent.normalize_observations
+    assert isinstance(agent.continual, continual.PackNet) and not agent.normalize_observations
     with pytest.raises(InputError, match="use normalize_observations="):
         run_config.parse(words)
 

@@ -7,7 +7,7 @@ import pytest
 from probes import Walk, prepare, random_batch, tiny, windows
 
 import mtjax
-from mtjax.agents import consolidating, renewing
+from mtjax.agents import task_changes, unit_resets
 from mtjax.agents.networks import Params
 from mtjax.agents.parts import put
 from mtjax.agents.parts.plasticity import Nothing
@@ -29,9 +29,9 @@ def made(way, **settings):
 def idle(state, unit):
     """A state in which the actor's second layer has one unit that nothing wakes."""
     actor = state.nets["actor"]
-    layer = renewing._layer(actor.shared, 1)
+    layer = unit_resets._layer(actor.shared, 1)
     quiet = layer._replace(bias=layer.bias.at[unit].set(-100.0))
-    return state.with_nets(actor=actor._replace(shared=renewing._with_layer(actor.shared, 1, quiet)))
+    return state.with_nets(actor=actor._replace(shared=unit_resets._with_layer(actor.shared, 1, quiet)))
 
 
 def outputs(agent, state, batch):
@@ -44,12 +44,12 @@ def test_redo_renews_idle_units_and_changes_no_output():
     """And the optimiser's moments around them are 0, those of others as they were."""
     agent, state, batch = made("redo", redo_every=1, dormant_threshold=0.0)
     before = idle(state, 3)
-    after = renewing.renew(agent, before, batch, jax.random.key(2), jnp.int32(0))
-    old, new = (renewing._layer(x.nets["actor"].shared, 1) for x in (before, after))
+    after = unit_resets.renew(agent, before, batch, jax.random.key(2), jnp.int32(0))
+    old, new = (unit_resets._layer(x.nets["actor"].shared, 1) for x in (before, after))
     assert new.bias[3] == 0 and not np.any(new.out[3]) and not np.any(new.into[:, 3] == old.into[:, 3])
     np.testing.assert_array_equal(outputs(agent, before, batch), outputs(agent, after, batch))
     moments = lambda x: x.fits["actor"].optimizer[1][0].mu["actor"].shared
-    old, new = (renewing._layer(moments(x), 1) for x in (before, after))
+    old, new = (unit_resets._layer(moments(x), 1) for x in (before, after))
     assert np.any(old.out[3]) and not np.any(new.out[3]) and not np.any(new.into[:, 3])
     awake = np.flatnonzero(np.any(old.into, axis=0))
     assert len(awake) > 1 and 3 in awake
@@ -61,7 +61,7 @@ def test_redo_renews_idle_units_and_changes_no_output():
 
 def test_redo_waits_for_its_turn():
     agent, state, batch = made("redo", redo_every=10, dormant_threshold=1e9)
-    renew = jax.jit(lambda number: renewing.renew(agent, state, batch, jax.random.key(2), number))
+    renew = jax.jit(lambda number: unit_resets.renew(agent, state, batch, jax.random.key(2), number))
     changed = lambda number: (
         not np.array_equal(
             renew(number).nets["actor"].shared["head"]["kernel"], state.nets["actor"].shared["head"]["kernel"]
@@ -73,15 +73,15 @@ def test_redo_waits_for_its_turn():
 def test_critics_are_renewed_each_by_its_own_units():
     """At a threshold above all activities every unit of both begins anew, with weights of its own."""
     agent, state, batch = made("redo", redo_every=1, dormant_threshold=1e9)
-    critic = renewing.renew(agent, state, batch, jax.random.key(2), jnp.int32(0)).nets["critic"].shared
-    into = renewing._layer(critic, 0).into
+    critic = unit_resets.renew(agent, state, batch, jax.random.key(2), jnp.int32(0)).nets["critic"].shared
+    into = unit_resets._layer(critic, 0).into
     assert into.shape[0] == 2 and not np.any(into[0] == into[1]) and not np.any(critic["head"]["kernel"])
 
 
 def test_continual_backprop_replaces_one_mature_unit_at_a_time():
     """With a rate of 1/16 for eight and six units: due after two and three updates; the renewed is the youngest."""
     agent, state, batch = made("continual-backprop", replacement_rate=1 / 16, maturity=0)
-    renew, ages = jax.jit(lambda state: renewing.renew(agent, state, batch, jax.random.key(2), jnp.int32(0))), []
+    renew, ages = jax.jit(lambda state: unit_resets.renew(agent, state, batch, jax.random.key(2), jnp.int32(0))), []
     for _ in range(3):
         state = renew(state)
         ages.append([np.sort(units.age).tolist() for units in state.nets["plasticity"].shared["actor"]])
@@ -93,7 +93,7 @@ def test_continual_backprop_replaces_one_mature_unit_at_a_time():
 def test_shrinking_and_perturbing_changes_what_tasks_share_alone():
     agent, state, _ = made("shrink-and-perturb", shrink=0.25, perturb=0.5, heads="per-task")
     fresh = agent.init(Walk().spec, TASKS, jax.random.key(9))
-    found = consolidating.change(agent, state, fresh)
+    found = task_changes.change(agent, state, fresh)
     expected = lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6)
     for name in ("actor", "critic"):
         old, new, drawn = (x.nets[name] for x in (state, found, fresh))

@@ -36,7 +36,7 @@ from mtjax.learning import loop
 from mtjax.learning.evaluation import load_evaluations, save_evaluations
 from mtjax.learning.loop import Settings
 from mtjax.names import Notice
-from mtjax.report import collect
+from mtjax.report import read_runs
 from mtjax.saved import checkpoint, log
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of, new_directory
@@ -498,7 +498,7 @@ def test_evaluations_of_another_run_are_refused(finished_run, copied_run, change
     with pytest.raises(InputError, match=f"is of another run than config.json beside it: {said}$"):
         evaluations_of(config, copied_run)
     with pytest.raises(InputError, match=said):
-        collect.read(copied_run)
+        read_runs.read(copied_run)
 
 
 def test_evaluations_of_another_run_are_not_gone_on_with(play, whole, tmp_path):

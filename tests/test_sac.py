@@ -16,7 +16,7 @@ from mtjax.agents.networks import Params, join
 from mtjax.agents.parts.encoders import Identity
 from mtjax.agents.parts.knowing import Parameters
 from mtjax.agents.parts.policies import Drawn, Gaussian
-from mtjax.agents.replayed import Batch
+from mtjax.agents.replay_batches import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import AgentState
 from mtjax.types import Spec, Transition

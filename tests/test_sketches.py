@@ -17,7 +17,7 @@ from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch
 from mtjax.agents.sketches import SubPolicies
 from mtjax.agents.state import of_task
-from mtjax.agents.unseen import describe_unseen
+from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.envs.craft.sketched import Sketched
 from mtjax.envs.parameters import Parameter
 from mtjax.experience import Rollouts

@@ -19,8 +19,8 @@ from probes import FEW, family_for, param
 import mtjax
 from mtjax import names, train
 from mtjax.agents import AGENTS, CHOICES, PARTS, settings
-from mtjax.agents.choices import flag_names
-from mtjax.command import help, refusals, run_config, sources, xla_flags
+from mtjax.agents.hyperparameters import flag_names
+from mtjax.command import class_sources, help, refusals, run_config, xla_flags
 from mtjax.config import with_preset
 from mtjax.envs import ENVS, SUITES, fields, outline
 from mtjax.envs.brax import NAMES
@@ -164,7 +164,7 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
         with contextlib.suppress(InputError):  # which this agent does not go with
             made = mtjax.agent(agent, **given, **needed)
             real |= {f"--{flag}": isinstance(settings(made)[name], bool) for name, flag in flag_names(made).items()}
-    assert sources.all_flags() == real
+    assert class_sources.all_flags() == real
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from probes import LEARNING, Probe, only_seed, tasks_of, tiny, train, values
 
 import mtjax
 from mtjax.agents import agent
-from mtjax.agents.choices import require_value_range
+from mtjax.agents.hyperparameters import require_value_range
 from mtjax.agents.parts.values import C51, VALUES, HLGauss, Scalar
 from mtjax.command.run_config import parse
 from mtjax.training import launch

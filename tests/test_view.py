@@ -26,12 +26,12 @@ from PIL import Image
 import mtjax.evaluate
 import mtjax.train
 from mtjax.checks import HOME
-from mtjax.command import beside
+from mtjax.command import live_page
 from mtjax.command.run_config import parse
 from mtjax.learning.evaluation import load_evaluations
 from mtjax.report import films, render
+from mtjax.report.page_data import Metrics
 from mtjax.report.view import Server, Worlds
-from mtjax.report.watch import Metrics
 from mtjax.saved import lock
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import resumed_config
@@ -315,7 +315,7 @@ POINT = (
 def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
     """Its metrics are the same, and the page ends with it. It is asked when the run begins."""
     asked = []
-    page = beside.page
+    page = live_page.page
 
     @contextlib.contextmanager
     def asking(port, *given):
@@ -323,7 +323,7 @@ def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
             asked.append(ask(port)["title"] if port else "")
             yield
 
-    monkeypatch.setattr(beside, "page", asking)
+    monkeypatch.setattr(live_page, "page", asking)
     found = []
     for name, words in (("with", [f"--view={free}"]), ("without", [])):
         mtjax.train.main([*POINT, f"--runs={tmp_path / name}", *words])

@@ -7,10 +7,10 @@ import probes
 import pytest
 from probes import act, learner, of_task, pick, quick, random_batch, slow_but, tasks_of, tiny
 
-from mtjax.agents import agent, replayed
+from mtjax.agents import agent, replay_batches
 from mtjax.agents.networks import STATISTICS, Network, Params
 from mtjax.agents.parts.encoders import BatchNorm
-from mtjax.agents.unseen import describe_unseen
+from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
@@ -31,7 +31,7 @@ def both_ends(made, state, batch, key):
     """Inputs of the critics (T, 2 B, x) at both ends of the transitions, as the update with this key draws actions."""
     target_key = jax.random.split(key, 4)[0]
     seen = probes.prepare(made, state, batch, TASKS)
-    _, aim = replayed.critic_data(made, state, seen, target_key)
+    _, aim = replay_batches.critic_data(made, state, seen, target_key)
     ends = (batch.obs, batch.action), (batch.next_obs, aim.next_action)
     return np.concatenate([np.concatenate(end, axis=-1) for end in ends], axis=1)
 
@@ -44,7 +44,7 @@ def test_targets_are_normalised_by_both_ends_of_the_batch_and_not_by_running_sta
     @jax.jit
     def target(state, batch):
         seen = probes.prepare(made, state, batch, TASKS)
-        return replayed.critic_data(made, state, seen, KEY)[1].target
+        return replay_batches.critic_data(made, state, seen, KEY)[1].target
 
     as_it_is = np.asarray(target(state, batch))
     slow = state.slow["critic"]

@@ -8,10 +8,10 @@ from mtjax.names import CHOICES, InputError, frozen, lazily, load, nearest_error
 
 if TYPE_CHECKING:
     from mtjax.agents.base import BaseAgent
-    from mtjax.agents.choices import PARTS, for_action, settings
+    from mtjax.agents.hyperparameters import PARTS, for_action, settings
     from mtjax.agents.sac import SAC
 
-_PLACES = {"PARTS": "choices", "settings": "choices", "for_action": "choices", "BaseAgent": "base", "SAC": "sac"}
+_PLACES = dict.fromkeys(("PARTS", "settings", "for_action"), "hyperparameters") | {"BaseAgent": "base", "SAC": "sac"}
 __getattr__, __dir__ = lazily(__name__, {name: f"mtjax.agents.{place}" for name, place in _PLACES.items()})
 
 
@@ -121,7 +121,7 @@ def agent(name: str, **given: Any) -> "BaseAgent":
         InputError: no agent has that name, no setting has one of the given names, or a value is not allowed.
     """
     preset = preset_of(name)
-    return load("mtjax.agents.choices:build")(name, preset.cls, preset.defaults, given)
+    return load("mtjax.agents.hyperparameters:build")(name, preset.cls, preset.defaults, given)
 
 
 def preset_of(name: str) -> Preset:
@@ -149,7 +149,7 @@ def tuned_as(name: str) -> str:
 
 def name_of(agent: Any) -> str:
     """Return the name of an agent: of those of its class, the one whose defaults it shares most."""
-    cls, own = type(agent), load("mtjax.agents.choices:settings")(agent)
+    cls, own = type(agent), load("mtjax.agents.hyperparameters:settings")(agent)
     homes = (cls, f"{cls.__module__}:{cls.__name__}")
     presets = {name: preset for name, preset in AGENTS.items() if preset.place in homes}
     shared = lambda preset: all(own.get(name) == value for name, value in frozen(preset.defaults).items())

@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import tyro
 
 from mtjax.agents import combinations, parts
-from mtjax.agents.choices import FLAT, PARTS, kinds_of
 from mtjax.agents.fit import Fit
+from mtjax.agents.hyperparameters import FLAT, PARTS, kinds_of
 from mtjax.agents.networks import Network, Params
+from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.encoders import Encoder
 from mtjax.agents.parts.gradients import descent, surgery
 from mtjax.agents.parts.knowing import Knowing, last_steps
 from mtjax.agents.parts.knowing.last_steps import Past
 from mtjax.agents.parts.plasticity import Plasticity
 from mtjax.agents.parts.policies import Gaussian, Policy
-from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling

@@ -6,7 +6,7 @@ import jax
 
 from mtjax import frames
 from mtjax.agents import parts
-from mtjax.agents.choices import PARTS
+from mtjax.agents.hyperparameters import PARTS
 from mtjax.agents.networks import Trunk
 from mtjax.agents.parts.policies import policy_for
 from mtjax.types import InputError, Spec

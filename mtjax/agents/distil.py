@@ -9,8 +9,8 @@ import tyro
 
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, descend
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, Policy
 from mtjax.agents.parts.samplers import Uniform

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mtjax.agents import combinations, parts
 from mtjax.agents.base import Heads, Memory
 from mtjax.agents.networks import Network, Params
-from mtjax.agents.replayed import ActorAux, Batch, Sample
+from mtjax.agents.replay_batches import ActorAux, Batch, Sample
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import AgentState, Nets
 from mtjax.types import Acted, Array, InputError, Key, Task

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import critics, parts
 from mtjax.agents.base import Inputs, Memory
-from mtjax.agents.choices import FLAT
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
 from mtjax.agents.parts import targets

@@ -6,9 +6,9 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import clipped, combinations, parts
+from mtjax.agents import clipped_ratio, combinations, parts
 from mtjax.agents.base import Inputs, Memory
-from mtjax.agents.choices import FLAT, PARTS
+from mtjax.agents.hyperparameters import FLAT, PARTS
 from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import ActorAux, Batch, OnPolicy
 from mtjax.agents.parts.adaptation import adapt, surrogate
@@ -73,7 +73,7 @@ class MAML(OnPolicy):
     """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
     clip_range: float = 0.2
     """Clip the ratio of policies to this distance from 1 (epsilon)."""
-    advantage_normalization: clipped.Normalization = "task"
+    advantage_normalization: clipped_ratio.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     inner_rate: float = 0.1
     """Length of an inner step, in gradients of the gain."""
@@ -124,9 +124,9 @@ class MAML(OnPolicy):
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to rollouts (T, H, E, ...), and fit the critic's units to them."""
-        return clipped.assess(self, state, steps, tasks, self.experience.apart)
+        return clipped_ratio.assess(self, state, steps, tasks, self.experience.apart)
 
-    gain = clipped.gain
+    gain = clipped_ratio.gain
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         played = Played.of(batch, self.experience.inner_steps + 1)

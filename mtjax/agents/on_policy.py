@@ -8,10 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import critics, parts, renewing
+from mtjax.agents import critics, parts, unit_resets
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
@@ -147,7 +147,7 @@ class OnPolicy(BaseAgent):
         values = self.critic_outputs
         critic = scale_head(self.critic.init(critic_key, num_tasks, values, *inputs.critic), jnp.zeros(values))
         kept = self.continual.init(actor, num_tasks, inputs.actor, count)
-        kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
+        kept = kept | unit_resets.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, units=critics.Units.begin(num_tasks).params())
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
@@ -216,7 +216,7 @@ class OnPolicy(BaseAgent):
         loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
         batch = self.view.keyed(batch, jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
-        state = renewing.renew(self, state, batch, jax.random.fold_in(key, 5), number)
+        state = unit_resets.renew(self, state, batch, jax.random.fold_in(key, 5), number)
         metrics = critic.aux | critic.metrics | actor.aux.metrics | actor.metrics
         return state, metrics | critics.explained(state, batch)
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import clipped, critics, parts
+from mtjax.agents import clipped_ratio, critics, parts
 from mtjax.agents.base import Inputs, Memory, network_of
 from mtjax.agents.fit import Fit
 from mtjax.agents.networks import Network
@@ -106,7 +106,7 @@ class Options(OnPolicy):
     """Adam's learning rate for sub-policies, terminations and the policy over options."""
     clip_range: float = 0.2
     """Clip the ratios of policies to this distance from 1 (epsilon)."""
-    advantage_normalization: clipped.Normalization = "task"
+    advantage_normalization: clipped_ratio.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     num_options: int = 8
     """Number of options (K)."""
@@ -206,10 +206,10 @@ class Options(OnPolicy):
         of_option, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
         known = of_option, upon, reward, here.state, at_option(here.options, taken.before)
         value, next_value, reward, of_state, of_before = map(in_order, known)
-        advantage = clipped.gae(self, tasks, steps._replace(reward=reward), value, next_value)
+        advantage = clipped_ratio.gae(self, tasks, steps._replace(reward=reward), value, next_value)
         target = value + advantage
         state, units = critics.renew(self, state, target)
-        mean, spread = clipped.moments(self.advantage_normalization, advantage)
+        mean, spread = clipped_ratio.moments(self.advantage_normalization, advantage)
         found = {
             "advantage": (advantage - mean) / spread,
             "choice_advantage": (target - of_state) / spread,
@@ -225,18 +225,18 @@ class Options(OnPolicy):
         """Return the critic's outputs (B, K) for observations (B, ...)."""
         return self.critic.apply(nets["critic"], *self.view.critic_inputs(nets, features, obs))
 
-    gain = clipped.gain
+    gain = clipped_ratio.gain
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:  # type: ignore[override]
         _, seen = self.view.actor_inputs(nets, batch.features, batch.obs)
         outputs = of_option(self, nets["actor"], seen, batch.option)
         log_ratio = limited(self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob)
-        gain, metrics = clipped.gain(self, log_ratio, batch)
+        gain, metrics = clipped_ratio.gain(self, log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
 
         logs, chosen = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs)), batch.chosen
         option_ratio = limited(at_option(logs, batch.option) - batch.option_log_prob)
-        choice, _ = clipped.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
+        choice, _ = clipped_ratio.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
 
         ends = ending(self, nets, batch.features, batch.obs, batch.before)

@@ -7,13 +7,13 @@ from typing import Annotated, ClassVar
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import clipped, parts
+from mtjax.agents import clipped_ratio, parts
 from mtjax.agents.base import Inputs
-from mtjax.agents.choices import FLAT
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import Batch, OnPolicy
+from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.plasticity import Plasticity
-from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.state import AgentState
 from mtjax.types import Array, Key, Task, Transition
 
@@ -68,7 +68,7 @@ class PPO(OnPolicy):
     """Clip the change of values in an update to this, in standard deviations of the targets; 0 does not clip."""
     kl_limit: float = 0.0
     """Stop updating the actor until the next rollout once KL(pi_old | pi) exceeds this; 0 never stops."""
-    advantage_normalization: clipped.Normalization = "task"
+    advantage_normalization: clipped_ratio.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     continual: Annotated[Continual, FLAT] = dataclasses.field(default_factory=Continual)
     plasticity: Annotated[Plasticity, FLAT] = dataclasses.field(default_factory=Plasticity)
@@ -86,12 +86,12 @@ class PPO(OnPolicy):
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
-        state, steps = clipped.assess(self, *super().assess(state, steps, tasks), tasks)
+        state, steps = clipped_ratio.assess(self, *super().assess(state, steps, tasks), tasks)
         return state.with_nets(limit=within(True)) if "limit" in state.nets else state, steps
 
     # Gradient steps.
 
-    gain = clipped.gain
+    gain = clipped_ratio.gain
 
     def fitting_loss(self, output: Array, batch: Batch) -> Array:
         limit = parts.limit(self.value_clip)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, descend
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mtjax.agents import combinations, renewing, replayed
+from mtjax.agents import combinations, replay_batches, unit_resets
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.choices import FLAT
 from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
+from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.plasticity import Plasticity
-from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
-from mtjax.agents.replayed import ActorAux, Batch, CriticAux, Sample
+from mtjax.agents.replay_batches import ActorAux, Batch, CriticAux, Sample
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Replay
 from mtjax.parallel.axes import when
@@ -83,9 +83,9 @@ class SAC(BaseAgent):
         log = jnp.full(1 if self.shared_temperature else num_tasks, log(self.initial_temperature)).astype(jnp.float32)
         temperature = Params({"log": log}, {}) if self.shared_temperature else Params({}, {"log": log})
         kept = self.continual.init(actor, num_tasks, inputs.actor, self.policy.outputs(len(action)))
-        kept = kept | renewing.begin(self, {"actor": actor, "critic": critic})
+        kept = kept | unit_resets.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, temperature=temperature)
-        return state._replace(slow=replayed.slow_copies(self, state.nets))
+        return state._replace(slow=replay_batches.slow_copies(self, state.nets))
 
     @property
     def fits(self) -> dict[str, Fit]:
@@ -115,7 +115,7 @@ class SAC(BaseAgent):
 
     def judge(self, state: AgentState, tasks: Task, steps: Transition) -> Array:
         """Return the values (T, B) of steps (T, B, ...), each as of its task, over the task's temperature."""
-        batch = replayed.prepare(self, state, jax.tree.map(lambda x: jnp.expand_dims(x, 2), steps), tasks)
+        batch = replay_batches.prepare(self, state, jax.tree.map(lambda x: jnp.expand_dims(x, 2), steps), tasks)
 
         def of_task(nets: Nets, batch: Batch) -> Array:
             q = self.values(nets, batch.features, batch.obs, batch.action)
@@ -132,7 +132,7 @@ class SAC(BaseAgent):
     def critic_loss(self, nets: Nets, batch: Batch, target: Any) -> tuple[Array, CriticAux]:
         q = self.q(nets, batch.features, batch.obs, batch.action)
         loss = jnp.mean(jnp.sum(self.value.loss(q, target), axis=0))
-        return replayed.fitted(self, loss, q, target, nets, batch)
+        return replay_batches.fitted(self, loss, q, target, nets, batch)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
@@ -158,23 +158,23 @@ class SAC(BaseAgent):
             number: () how many updates came before; actor and temperatures learn at every ``policy_delay``-th.
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
-        batch = replayed.prepare(self, state, window, tasks, jax.random.fold_in(key, 1))
+        batch = replay_batches.prepare(self, state, window, tasks, jax.random.fold_in(key, 1))
         batch = self.view.keyed(batch, jax.random.fold_in(key, 2))
         before = state.nets["representation"]
         importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
 
-        data = replayed.critic_data(self, state, batch, target_key)
+        data = replay_batches.critic_data(self, state, batch, target_key)
         loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
         state, fitted = descend(self.fits, "critic", state, loss, data, critic_order, importance)
-        state = replayed.with_statistics(state, "critic", fitted.aux.statistics)
+        state = replay_batches.with_statistics(state, "critic", fitted.aux.statistics)
 
         def improve(state: AgentState) -> tuple[AgentState, Metrics]:
             seen = {"representation": representation.without(self.representation.own_target).filled(before)}
             data, before_step = (batch, jax.random.split(actor_key, len(batch.temperature))), state.nets
             state, improved = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance, seen)
             state = state._replace(nets=self.continual.kept(before_step, state.nets))
-            state = replayed.with_statistics(state, "actor", improved.aux.statistics)
-            data = (improved.aux.entropy, replayed.action_sizes(batch.action, batch.mask))
+            state = replay_batches.with_statistics(state, "actor", improved.aux.statistics)
+            data = (improved.aux.entropy, replay_batches.action_sizes(batch.action, batch.mask))
             state, _ = descend(self.fits, "temperature", state, self.temperature_loss, data, actor_order)
             return state, improved.aux.metrics | improved.metrics
 
@@ -184,6 +184,6 @@ class SAC(BaseAgent):
         if delay > 1:
             actor_metrics = Sometimes.over(actor_metrics, turn)
 
-        state = replayed.renew_scales(self, replayed.update_target(self, state), fitted.aux.expected)
-        state = renewing.renew(self, state, batch, jax.random.fold_in(key, 3), number)
+        state = replay_batches.renew_scales(self, replay_batches.update_target(self, state), fitted.aux.expected)
+        state = unit_resets.renew(self, state, batch, jax.random.fold_in(key, 3), number)
         return state, fitted.aux.metrics | actor_metrics | {"temperature": batch.temperature} | fitted.metrics

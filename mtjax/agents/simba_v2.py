@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from mtjax.agents.choices import FLAT
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.parts.encoders import Encoder, Hypersphere
 from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling

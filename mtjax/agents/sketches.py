@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from mtjax.agents import clipped, combinations, parts
+from mtjax.agents import clipped_ratio, combinations, parts
 from mtjax.agents.base import Heads, Inputs
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.on_policy import OnPolicy, with_head
@@ -81,7 +81,7 @@ class Sketches(OnPolicy):
     """What each task has for itself of its critic: whole networks (disjoint)."""
     clip_range: float = 0.2
     """Clip the ratio of policies to this distance from 1 (epsilon)."""
-    advantage_normalization: clipped.Normalization = "task"
+    advantage_normalization: clipped_ratio.Normalization = "task"
     """Scale advantages to mean 0 and standard deviation 1: never, over all tasks together, or in each task."""
     sharing: Literal["symbols", "tasks", "all"] = "symbols"
     """What has a policy of its own: every symbol (symbols), every task (tasks), or nothing (all)."""
@@ -127,11 +127,11 @@ class Sketches(OnPolicy):
 
     # Learning, as PPO does.
 
-    gain = clipped.gain
+    gain = clipped_ratio.gain
 
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
-        return clipped.assess(self, state, steps, tasks)
+        return clipped_ratio.assess(self, state, steps, tasks)
 
 
 def with_lengths(agent: Any, state: AgentState, tasks: Task) -> AgentState:

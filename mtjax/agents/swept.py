@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mtjax.agents import BaseAgent, parts
-from mtjax.agents.choices import flag_names, kinds_of, settings
+from mtjax.agents.hyperparameters import flag_names, kinds_of, settings
 from mtjax.checks import shown
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError

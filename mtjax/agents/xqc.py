@@ -6,13 +6,13 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import replayed
-from mtjax.agents.choices import FLAT
+from mtjax.agents import replay_batches
+from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
 from mtjax.agents.parts.values import C51, Value, reduce
-from mtjax.agents.replayed import ActorAux, Batch, CriticAux
+from mtjax.agents.replay_batches import ActorAux, Batch, CriticAux
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import Nets
 from mtjax.types import Array, Key
@@ -89,7 +89,7 @@ class XQC(SAC):
     def critic_loss(self, nets: Nets, batch: Batch, target: Aim) -> tuple[Array, CriticAux]:
         q, _, statistics = self.q_of_both(nets, batch, target.next_action)
         loss = jnp.mean(jnp.sum(self.value.loss(q, target.target), axis=0))
-        return replayed.fitted(self, loss, q, target.target, nets, batch, statistics)
+        return replay_batches.fitted(self, loss, q, target.target, nets, batch, statistics)
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         outputs, statistics = self.actor.fit(nets["actor"], *self.view.actor_inputs(nets, batch.features, batch.obs))

@@ -3,7 +3,7 @@
 import textwrap
 
 from mtjax.agents import AGENTS
-from mtjax.command.sources import OF_EVERY_RUN, documented_fields
+from mtjax.command.class_sources import OF_EVERY_RUN, documented_fields
 from mtjax.envs import BENCHMARKS, ENVS, SUITES, outline, varied
 from mtjax.saved import pretrained
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from mtjax import agents
 from mtjax.agents import BaseAgent, parts, swept
-from mtjax.agents.choices import PARTS, unknown_setting
-from mtjax.agents.choices import settings as settings_of
+from mtjax.agents.hyperparameters import PARTS, unknown_setting
+from mtjax.agents.hyperparameters import settings as settings_of
 from mtjax.agents.swept import Sweep
 from mtjax.checks import shown
 from mtjax.config import Plan, RunConfig, configure, describe_teacher, fit_length, own_files, with_preset

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import TypeVar
 
-from mtjax.command.words import switched_off
+from mtjax.command.flags import switched_off
 from mtjax.names import InputError
 
 P = TypeVar("P")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mtjax.agents import AGENTS
 from mtjax.checks import require_run
-from mtjax.command.sources import all_flags, as_flag, whole_flags
-from mtjax.command.words import VARY, flag_value, is_whole, switched_off, switched_on, with_port
+from mtjax.command.class_sources import all_flags, as_flag, whole_flags
+from mtjax.command.flags import VARY, flag_value, is_whole, switched_off, switched_on, with_port
 from mtjax.envs import BENCHMARKS, ENVS, members
 from mtjax.names import PRESETS, InputError, nearest_error
 from mtjax.saved import pretrained

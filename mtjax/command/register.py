@@ -7,7 +7,7 @@ from typing import Any
 
 from mtjax import agents, envs
 from mtjax.agents.base import BaseAgent
-from mtjax.agents.choices import CHOICES, PARTS
+from mtjax.agents.hyperparameters import CHOICES, PARTS
 from mtjax.checks import shown
 from mtjax.envs.family import Family
 from mtjax.names import InputError, first_sentence, public
@@ -15,7 +15,7 @@ from mtjax.names import InputError, first_sentence, public
 _GONE = {
     "check": "settings are checked in __post_init__",
     "relabel": "families relabel steps, by relabel(task, transition, key)",
-    "consolidate": "a part of the kind continual does it, which derives from mtjax.agents.parts.remembering.Nothing",
+    "consolidate": "a part of the kind continual does it, which derives from mtjax.agents.parts.continual.Nothing",
 }
 """Methods of agents that once were called, and what is in their place."""
 

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from mtjax.agents import preset_of, settings
-from mtjax.agents.choices import CHOICES, flag_names, owners
+from mtjax.agents.hyperparameters import CHOICES, flag_names, owners
+from mtjax.command.class_sources import all_flags
+from mtjax.command.flags import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags, with_port
 from mtjax.command.imports import import_files, imports_of
 from mtjax.command.parsing import parse_with_tyro
 from mtjax.command.refusals import check_names, unknown_flag
-from mtjax.command.sources import all_flags
-from mtjax.command.words import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags, with_port
 from mtjax.config import NO_FINE_TUNING, RunConfig, describe_teacher, fit_length, own_files, with_preset
 from mtjax.envs import is_mixture, make, require_pictures
 from mtjax.envs.family import Family

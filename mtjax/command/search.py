@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from mtjax.agents import swept
-from mtjax.agents.choices import flag_names
+from mtjax.agents.hyperparameters import flag_names
 from mtjax.checks import amount, require_library
+from mtjax.command.flags import flag_value, split_flags
 from mtjax.command.run_config import draft, parse
-from mtjax.command.words import flag_value, split_flags
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.saved import checkpoint, lock, survivors

@@ -18,8 +18,8 @@ import numpy as np
 
 from mtjax.agents import AGENTS, PARTS, swept
 from mtjax.checks import amount
+from mtjax.command.flags import flag_value
 from mtjax.command.run_config import draft, parse
-from mtjax.command.words import flag_value
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
 from mtjax.learning.evaluation import Evaluations

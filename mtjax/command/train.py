@@ -5,9 +5,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mtjax.agents.unseen import describe_unseen
+from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.checks import require_port
-from mtjax.command import beside, search, sweep
+from mtjax.command import live_page, search, sweep
 from mtjax.command.run_config import parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
@@ -32,7 +32,7 @@ def main(argv: Sequence[str]) -> None:
     if "--distributed" in argv:
         hosts.initialise()  # before anything looks at the devices
     paged = any(word.split("=", 1)[0] == "--view" for word in argv)
-    beside.require_none(paged and (search.is_search(argv) or sweep.is_sweep(argv)))
+    live_page.require_none(paged and (search.is_search(argv) or sweep.is_sweep(argv)))
     if search.is_search(argv):
         return search.main(argv)
     if sweep.is_sweep(argv):
@@ -49,10 +49,10 @@ def main(argv: Sequence[str]) -> None:
     start = None if begun else load_start(config)
     check(config, start)
     if directory is None and memory.seeds_exceed_memory(config):
-        beside.require_none(config.view)
+        live_page.require_none(config.view)
         return sweep.run_all([config], "rounds")
     directory = _prepare(config, directory)
-    with beside.page(config.view * hosts.is_first(), directory, import_flags(config)):
+    with live_page.page(config.view * hosts.is_first(), directory, import_flags(config)):
         result = launch(config, Hooks(directory, start, resume))
         if hosts.is_first():
             _conclude(config, result, directory)

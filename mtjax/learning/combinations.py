@@ -6,7 +6,7 @@ import jax
 
 from mtjax import frames
 from mtjax.agents import BaseAgent
-from mtjax.agents.consolidating import consolidates
+from mtjax.agents.task_changes import consolidates
 from mtjax.envs import Family
 from mtjax.learning.loop import Settings
 from mtjax.types import Agent, Env, InputError

@@ -24,7 +24,7 @@ from mtjax.types import Array, InputError, Key, Returning, Task
 class Curriculum(abc.ABC):
     """Says which tasks are played, and in worlds that are not reset what follows what."""
 
-    steps: Any = 0  # of every environment, after which tasks change; 0 for never
+    steps: Any  # of every environment, after which tasks change; 0 for never
     in_turn: ClassVar[bool] = False  # whether one task is played after another, for so many steps each
     returns: ClassVar[bool] = False  # whether worlds go back to where they began, which they must not be reset for
 
@@ -55,6 +55,8 @@ class Curriculum(abc.ABC):
 @dataclasses.dataclass(frozen=True)
 class Everything(Curriculum):
     """All tasks are played, always."""
+
+    steps: ClassVar[int] = 0
 
     def count(self, known: int) -> int:
         return known

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.consolidating import change, consolidate, consolidates
 from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, numbers_of, with_numbers
+from mtjax.agents.task_changes import change, consolidate, consolidates
 from mtjax.checks import check_fields
 from mtjax.learning import curricula
 from mtjax.learning.rollout import (

@@ -15,7 +15,7 @@ from mtjax.envs.engines import host
 from mtjax.learning.evaluation import Recording, record
 from mtjax.learning.rollout import Worlds
 from mtjax.names import SPLITS, InputError, nearest_error, public
-from mtjax.report import collect, figures
+from mtjax.report import figures, read_runs
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
 from mtjax.types import Task, Transition
@@ -58,7 +58,7 @@ def posterior(runs: Any, split: str = "train") -> "list[Axes]":
         raise nearest_error("split", split, SPLITS)
     policy = _policy(runs)
     way = policy.agent.conditioning.inference
-    return _draw(believed(policy, split), f"{way} on {collect.env_name_of(policy.env)}, {split}")
+    return _draw(believed(policy, split), f"{way} on {read_runs.env_name_of(policy.env)}, {split}")
 
 
 def _policy(runs: Any) -> Policy:
@@ -68,7 +68,7 @@ def _policy(runs: Any) -> Policy:
     if isinstance(runs, Policy | Result):
         _require(runs.agent)
         return runs if isinstance(runs, Policy) else runs.policy()
-    if isinstance(runs, Mapping) or len(found := collect.read(runs)) > 1:
+    if isinstance(runs, Mapping) or len(found := read_runs.read(runs)) > 1:
         raise InputError("posterior is of one run, and these are several")
     _require(found[0].config.learner)
     return load(found[0].directory)

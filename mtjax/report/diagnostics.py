@@ -22,7 +22,7 @@ from mtjax.agents import SAC
 from mtjax.agents.fit import Problem, above
 from mtjax.agents.networks import Network, Params, ReLU
 from mtjax.agents.parts.gradients import surgery
-from mtjax.agents.replayed import critic_data, prepare
+from mtjax.agents.replay_batches import critic_data, prepare
 from mtjax.agents.state import Nets, axes_of
 from mtjax.experience.ring import Ring
 from mtjax.report import figures

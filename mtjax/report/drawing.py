@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mtjax.names import InputError, nearest_error, public
-from mtjax.report import collect, plots
+from mtjax.report import plots, read_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,12 +71,12 @@ def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: st
         raise InputError("there was nothing to draw")
 
 
-def _learned(runs: Any, metric: str) -> list[collect.Learned]:
-    return collect.learned(runs) if metric == "return" else collect.of_metric(runs, metric)
+def _learned(runs: Any, metric: str) -> list[read_runs.Learned]:
+    return read_runs.learned(runs) if metric == "return" else read_runs.of_metric(runs, metric)
 
 
 def _draw(
-    name: str, runs: Any, learned: Callable[[], list[collect.Learned]], split: str, baseline: str
+    name: str, runs: Any, learned: Callable[[], list[read_runs.Learned]], split: str, baseline: str
 ) -> "Axes | list[Axes]":
     given = {} if name == "parameter" else {"split": split}
     given |= {"baseline": baseline} if name == "improvement" and baseline else {}

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mtjax.names import InputError, nearest_error, public
-from mtjax.report import collect, figures
+from mtjax.report import figures, read_runs
 from mtjax.report.beliefs import posterior
-from mtjax.report.collect import Learned
+from mtjax.report.read_runs import Learned
 from mtjax.report.stats import iqm as iqm_of
 from mtjax.report.stats import probability_of_improvement, seed_interval
 from mtjax.types import SPLITS
@@ -194,7 +194,7 @@ def _of_split(runs: Any, split: str) -> list[Learned]:
     """Return what was learned in runs that have tasks of a split."""
     if split not in SPLITS:
         raise nearest_error("split", split, SPLITS)
-    found = [one for one in collect.learned(runs) if one.returns[split].size and len(one.steps)]
+    found = [one for one in read_runs.learned(runs) if one.returns[split].size and len(one.steps)]
     if not found:
         raise InputError(f"no run was given that has {split} tasks")
     return found

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.agents.unseen import describe_unseen
+from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
 from mtjax.envs import Family

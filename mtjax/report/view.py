@@ -29,8 +29,8 @@ from mtjax.compiling.programs import enable_compile_cache
 from mtjax.learning.evaluation import Recording
 from mtjax.names import SPLITS, InputError
 from mtjax.report import films
+from mtjax.report.page_data import Watched
 from mtjax.report.scoring import first_seed, other_tasks, with_tasks
-from mtjax.report.watch import Watched
 from mtjax.saved import checkpoint, lock, pretrained
 from mtjax.saved.config_json import from_json
 from mtjax.saved.policy import Policy, load

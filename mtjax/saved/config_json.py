@@ -14,7 +14,7 @@ import jax
 
 from mtjax import __version__
 from mtjax.agents import AGENTS, agent, settings
-from mtjax.agents.choices import flag_names, replace
+from mtjax.agents.hyperparameters import flag_names, replace
 from mtjax.checks import require_run, require_values
 from mtjax.config import Plan, RunConfig
 from mtjax.envs import ENVS, is_mixture, make

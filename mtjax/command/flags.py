@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from mtjax.command.sources import all_flags, whole_flags
+from mtjax.command.class_sources import all_flags, whole_flags
 from mtjax.names import InputError
 
 VARY = "--env.vary."

@@ -7,12 +7,12 @@ from typing import Any, TypeVar, get_type_hints
 import tyro
 
 from mtjax.agents import parts
+from mtjax.agents.parts.continual import CONTINUAL
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.knowing import CONDITIONINGS
 from mtjax.agents.parts.plasticity import PLASTICITY
 from mtjax.agents.parts.policies import policy_for
-from mtjax.agents.parts.remembering import CONTINUAL
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS

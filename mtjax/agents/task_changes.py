@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import replayed
+from mtjax.agents import replay_batches
 from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
@@ -54,7 +54,7 @@ def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) ->
 def _seen(agent: Any, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
     """Return features (T, ...) and observations (T, N, ...) of windows, as ``agent.view.actor_inputs`` takes them."""
     if agent.experience.storage.kept:
-        batch = replayed.prepare(agent, state, window, tasks)
+        batch = replay_batches.prepare(agent, state, window, tasks)
         return batch.features, batch.obs
     _, features, obs, _ = agent.view.steps(state, window, tasks)
     return features, obs
