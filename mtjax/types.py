@@ -6,7 +6,6 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
@@ -317,6 +316,7 @@ class Storage(NamedTuple):
     axes: Any  # of the data under a map over seeds
     sharding: Any  # of the data, as a tree of PartitionSpec
     kept: bool  # whether the next iteration needs it
+    flags: tuple[str, ...]  # which say how much there is
 
 
 class Experience(Protocol):
@@ -329,8 +329,6 @@ class Experience(Protocol):
 
     @property
     def batch_size(self) -> int: ...  # transitions of each task in an update; 0: a share of those collected
-    @property
-    def sized_by(self) -> Sequence[str]: ...  # flags that say how much data it holds
     @property
     def hindsight(self) -> float: ...  # the share of what is learned from that is relabelled as another task's
     @property

@@ -203,7 +203,7 @@ READERS = ("learning", "compiling", "parallel.axes", "training.run", "training.m
 KNOWN = {  # where it is known which class it is
     types.Env: {"calls", "relabels", "varied", "fresh_goals", "observe_worlds", "returning", "distance"},
     types.Agent: {"adapt", "conditioning", "gradients", "heads", "representation", "view"},
-    types.Experience: {"capacity", "hindsight", "n_step"},
+    types.Experience: {"capacity", "n_step"},
 }
 
 

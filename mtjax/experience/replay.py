@@ -36,7 +36,8 @@ class Buffer(NamedTuple):
 
 _SEEDS, _WHOLE = PartitionSpec("seeds"), PartitionSpec()
 _RING = Ring(PartitionSpec("seeds", None, None, collectives.AXIS), _WHOLE, _WHOLE, _WHOLE)  # type: ignore
-_STORAGE = Storage(axes=Buffer(OVER_SEEDS, None, 0), sharding=Buffer(_RING, _WHOLE, _SEEDS), kept=True)  # type: ignore
+_SHARDING = Buffer(_RING, _WHOLE, _SEEDS)  # type: ignore
+_STORAGE = Storage(Buffer(OVER_SEEDS, None, 0), _SHARDING, kept=True, flags=("replay-size",))  # type: ignore
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,11 +142,6 @@ class Replay:
     def steps(self) -> int:
         """Steps of every environment before the agent learns again."""
         return self.update_every
-
-    @property
-    def sized_by(self) -> tuple[str, ...]:
-        """Flags that say how much data it holds."""
-        return "replay-size", *["host-replay-size"] * bool(self.host_replay_size)
 
     def capacity(self, num_envs: int) -> int:
         """Return how many transitions each task's ring holds: the replay size, rounded down to whole iterations."""

@@ -29,13 +29,12 @@ class Rollouts:
     minibatches: int = 8
     """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass."""
 
-    storage: ClassVar[Storage] = Storage(axes=0, sharding=(), kept=False)
+    storage: ClassVar[Storage] = Storage(axes=0, sharding=(), kept=False, flags=("num-envs",))
     policy_delay: ClassVar[int] = 1  # the actor learns in every update
     reset_every: ClassVar[int] = 0  # networks are never reset
     warmup_steps: ClassVar[int] = 0  # no action is random before learning
     adaptations: ClassVar[int] = 0  # the policy stays as it is while it plays
     batch_size: ClassVar[int] = 0  # a share of the steps that are collected
-    sized_by: ClassVar[tuple[str, ...]] = ("num-envs",)
     hindsight: ClassVar[float] = 0.0  # no step is relabelled
 
     def __post_init__(self):
@@ -106,8 +105,8 @@ class Rollouts:
         return order[:, : size * self.minibatches].reshape(-1, size)
 
     def draw(self, spec: Spec, agent: Any, steps: Transition, key: Key, count: int) -> Transition:
-        """Draw ``count`` single steps of every task as windows (T, count, 1, ...), of a rollout (T, H, E, ...)."""
-        flat = windows(steps, 0)
+        """Draw ``count`` windows (T, count, L, ...) of every task, as long as the agent needs them, of (T, H, E, ...)."""
+        flat = windows(steps, agent.unroll)
         return jax.tree.map(lambda x: x[:, jax.random.randint(key, (count,), 0, x.shape[1])], flat)
 
     def window(self, data: Transition, batch: Array) -> Transition:

@@ -222,7 +222,8 @@ class _Run:
         if line := meshes.describe(self.config.mesh, len(self.seeds), settings.num_envs):
             self.console.say(line)
         if self.hooks.directory is not None:
-            checkpoint.require_space(self.hooks.directory, shapes, needs.host, self.agent.experience.sized_by)
+            flags = [*self.agent.experience.storage.flags, *["host-replay-size"] * bool(needs.host)]
+            checkpoint.require_space(self.hooks.directory, shapes, needs.host, flags)
 
     def _open_sinks(self, steps: int) -> list[Sink]:
         """Return where metrics go beside metrics.csv, in a run that is at a step."""
