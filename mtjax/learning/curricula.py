@@ -21,26 +21,27 @@ from mtjax.tasks import draw_at, episode_task
 from mtjax.types import Array, InputError, Key, Returning, Task
 
 
-class Curriculum(abc.ABC):
-    """Says which tasks are played, and in worlds that are not reset what follows what."""
+@dataclasses.dataclass(frozen=True)
+class Everything:
+    """All tasks are played, always. Every curriculum is a class with these methods."""
 
-    steps: Any  # of every environment, after which tasks change; 0 for never
+    steps: ClassVar[int] = 0  # of every environment, after which tasks change; 0 for never
     in_turn: ClassVar[bool] = False  # whether one task is played after another, for so many steps each
-    returns: ClassVar[bool] = False  # whether worlds go back to where they began, which they must not be reset for
+    returns: ClassVar[bool] = False  # whether worlds go back to where they began, for which none may be reset
 
-    @abc.abstractmethod
     def count(self, known: int) -> int:
         """Return the number T of tasks that are played at a time, of N that are known."""
+        return known
 
-    @abc.abstractmethod
     def rows(self, step: Array, known: int) -> Array:
         """Return the numbers (T,) int32 of the tasks that are played from a step () of every environment on."""
+        return jnp.arange(known, dtype=jnp.int32)
 
     def heard(self, known: int) -> Array | None:
         """Return what was heard (N, 2) of tasks before any episode has ended; None if nothing is ever heeded."""
         return None
 
-    def next_rows(self, step: Array, chunk: int, rows: Array, heard: Any, known: int) -> Array:
+    def next_rows(self, step: Array, chunk: int, rows: Any, heard: Any, known: int) -> Array:
         """Return the tasks (T,) of a chunk of so many steps that begins at a step (), after those of ``rows``."""
         return self.rows(step, known)
 
@@ -50,19 +51,6 @@ class Curriculum(abc.ABC):
         By default it is any draw, wherever the world is.
         """
         return episode_task(listed, key)
-
-
-@dataclasses.dataclass(frozen=True)
-class Everything(Curriculum):
-    """All tasks are played, always."""
-
-    steps: ClassVar[int] = 0
-
-    def count(self, known: int) -> int:
-        return known
-
-    def rows(self, step: Array, known: int) -> Array:
-        return jnp.arange(known, dtype=jnp.int32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,11 +91,13 @@ class Graph(Everything):
 
 
 @dataclasses.dataclass(frozen=True)
-class Random(Curriculum):
+class Random:
     """Some tasks are played, and others drawn after so many steps of every environment, without repeating one."""
 
     played: int
     steps: int
+    in_turn, returns = False, False
+    heard, next_rows, follow = Everything.heard, Everything.next_rows, Everything.follow
 
     def count(self, known: int) -> int:
         if not 1 <= self.played <= known:
@@ -122,14 +112,15 @@ class Random(Curriculum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Sequence(Curriculum):
+class Sequence:
     """One task is played after another, in the order of the table, for so many steps of every environment each.
 
     After the last one the first follows again.
     """
 
-    in_turn = True
     steps: int
+    in_turn, returns = True, False
+    heard, next_rows, follow = Everything.heard, Everything.next_rows, Everything.follow
 
     def count(self, known: int) -> int:
         return 1
@@ -154,7 +145,7 @@ def _key(number: Array) -> Key:
 
 
 @dataclasses.dataclass(frozen=True)
-class Heeding(Curriculum):
+class Heeding:
     """Some tasks are chosen by what was heard of all: the returns of the policy that learns, as means over seeds.
 
     Of each task (N, 2) a fast and a slow mean over the chunks that played it are kept, NaN before its first episode has
@@ -164,7 +155,8 @@ class Heeding(Curriculum):
     played: int
     steps: int
 
-    count = Random.count
+    in_turn, returns = False, False
+    count, follow = Random.count, Everything.follow
 
     def rows(self, step: Array, known: int) -> Array:
         return self.choose(step, self.heard(known))
@@ -253,6 +245,7 @@ def hear(heard: Array, rows: Array, returns: Array) -> Array:
 
 
 EVERYTHING = Everything()
+Curriculum = Everything | Random | Heeding | Sequence
 _OF_ALL = {"all": EVERYTHING, "forward-backward": ForwardBackward(), "graph": Graph()}
 _KINDS = {  # with how many numbers each has
     "random": (Random, 2),

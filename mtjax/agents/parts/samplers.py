@@ -16,8 +16,10 @@ from mtjax.types import Array, InputError, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class Uniform(Watcher):
+class Uniform:
     """Weighs all tasks equally. Every sampler is a class with these methods."""
+
+    init, begin, remember, observe = Watcher.init, Watcher.begin, Watcher.remember, Watcher.observe
 
     def weights(self, memory: Any, temperature: Array) -> Array | None:
         """Return the weights (T,) of the tasks' losses, of mean 1; None for all 1. ``temperature`` (T,) is SAC's."""

@@ -1,15 +1,12 @@
-"""``Watcher`` is a part that follows episodes as they are played, and counts the steps that were collected."""
+"""``Watcher`` says what scalings and samplers follow of episodes as they are played, and of the steps collected."""
 
-from typing import Any
+from typing import Any, Protocol
 
 from mtjax.types import Array, Transition
 
 
-class Watcher:
-    """It may keep statistics of all steps, its memory, and something of each episode so far. By default it keeps none.
-
-    So are the scaling of rewards and the sampler of tasks.
-    """
+class Watcher(Protocol):
+    """It may keep statistics of all steps, its memory, and something of each episode. By default it keeps neither."""
 
     def init(self, num_tasks: int) -> Any:
         """Return the memory before the first step; leaves are (T, ...)."""

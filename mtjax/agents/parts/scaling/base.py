@@ -11,10 +11,11 @@ from mtjax.types import Array, Transition
 
 
 @dataclasses.dataclass(frozen=True)
-class NoScaling(Watcher):
+class NoScaling:
     """Leaves rewards as they are. Every scaling is a class with these methods."""
 
     follows_resets: ClassVar[bool] = False  # whether its units are renewed by resets of networks alone
+    init, begin, remember, observe = Watcher.init, Watcher.begin, Watcher.remember, Watcher.observe
 
     def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:
         """Return each task's factor and offset (T,); None for 1 and 0.
