@@ -201,8 +201,8 @@ def ours(arguments: argparse.Namespace, name: str, side: str, seed: int) -> tupl
     import mtjax
     from mtjax.compiling.programs import enable_compile_cache
     from mtjax.config import configure
+    from mtjax.training.journal import Hooks
     from mtjax.training.launch import check, launch
-    from mtjax.training.run import Hooks
 
     enable_compile_cache()
     config = mtjax.preset(ENVS[name], "ppo", "gpu")

@@ -28,8 +28,8 @@ from mtjax.envs.probes import AFTER, LIMIT, RULES, SPEC, Probe, tasks_of
 from mtjax.experience import Replay, rollouts
 from mtjax.frames import seen
 from mtjax.learning import loop
+from mtjax.training.journal import Hooks
 from mtjax.training.launch import check, launch
-from mtjax.training.run import Hooks
 from mtjax.types import Acted, MultiDiscrete, Spec, Step, Task, Transition
 
 __all__ = ["AFTER", "LIMIT", "RULES", "SPEC", "Probe", "tasks_of"]

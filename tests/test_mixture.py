@@ -661,7 +661,7 @@ def test_a_run_goes_on_bit_for_bit(tmp_path, monkeypatch):
     agent, plan = tiny("sac", normalize_observations=True), {**PLAN, "eval_every": 40}
     drawn, told = mixture([Aim(vary={"goal": "-1:1"}, num_draws=5), WIDE]), []
     with monkeypatch.context() as patch:
-        patch.setattr("mtjax.training.run.write_rows", lambda sinks, rows, names: told.extend(rows))
+        patch.setattr("mtjax.training.journal.write_rows", lambda sinks, rows, names: told.extend(rows))
         whole = mtjax.train(drawn, agent, **plan, steps=80)
     found, logged = whole.evaluations, [row for row in told if "evaluation/train" in row]
     for scores, name in ((found.returns, ""), (found.metrics["success"], "/success")):

@@ -22,6 +22,7 @@ from mtjax.learning.loop import Settings
 from mtjax.names import Notice
 from mtjax.report import read_runs
 from mtjax.saved.config_json import from_json
+from mtjax.saved.folder import evaluations_before
 from mtjax.training import selection
 from mtjax.training.run import _Progress, _Run
 from mtjax.types import InputError
@@ -223,13 +224,13 @@ def test_a_member_that_diverged_is_given_up(capsys):
 def test_who_was_given_up_stays_so_in_a_resumed_run():
     """As its last returns say."""
     run, programs = _Run(of_population("halving:100", seeds=3, eval_episodes=1)), Programs(None, None, {})
-    returns = {split: np.zeros((3, 1, *x.shape[2:])) for split, x in run._no_evaluations().returns.items()}
+    returns = {split: np.zeros((3, 1, *x.shape[2:])) for split, x in evaluations_before(run.config).returns.items()}
     returns["train"][1] = np.nan
-    past = run._no_evaluations()._replace(steps=np.array([96]), returns=returns)
+    past = evaluations_before(run.config)._replace(steps=np.array([96]), returns=returns)
     records = types.SimpleNamespace(
         earlier_evaluations=lambda *_: past, earlier_seconds=lambda *_: (0.0, 0.0), keep_history=lambda steps: None
     )
-    run.__dict__["records"] = records
+    run.journal.__dict__["records"] = records
     state = loop.TrainState(*[None] * 5, np.int32(0), None)
     assert run._begin(programs, state, 96).diverged.tolist() == [False, True, False]
 

@@ -41,8 +41,9 @@ from mtjax.saved import checkpoint, log
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of, new_directory
 from mtjax.saved.records import Records
-from mtjax.training import run
+from mtjax.training import entries, journal, run
 from mtjax.training.console import Clock
+from mtjax.training.journal import Journal
 from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import SPLITS, InputError
 
@@ -225,7 +226,7 @@ def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
     Seconds and rates are those of a chunk, for all seeds.
     """
     made, rates = [], []
-    monkeypatch.setattr(run, "Clock", lambda *given: made.append((given, Clock(*given))) or made[-1][1])
+    monkeypatch.setattr(journal, "Clock", lambda *given: made.append((given, Clock(*given))) or made[-1][1])
     monkeypatch.setattr(run.Console, "progress", lambda console, steps, passed, rate, *_: rates.append(rate))
     results = play(tmp_path, steps=500), play(tmp_path, steps=800, resume=True)
     assert [given for given, _ in made] == [(5, 3, 1), (3, 2, 0)]
@@ -539,11 +540,11 @@ def test_the_clock_counts_without_going_through_the_chunks():
         one = types.SimpleNamespace(config=config, console=types.SimpleNamespace(total=total))
         steps = chunk * min(begun - 1, count)
         ends = range(steps + chunk, total + chunk, chunk)
-        clock, due = run._Run._clock(one, steps), [run._Run._is_due(one, end) for end in ends]
+        clock, due = Journal._clock(one, steps), [run.is_due(config, end) for end in ends]
         expected = len(ends), sum(due), sum(end - chunk < warmup for end in ends)
         assert (clock.chunks, clock.evaluations, clock.warmup) == expected
     one.console.total = 10**15 * chunk
-    assert run._Run._clock(one, 0).chunks == 10**15
+    assert Journal._clock(one, 0).chunks == 10**15
 
 
 @pytest.mark.slow
@@ -655,9 +656,9 @@ def test_spoiled_parameters_are_not_saved(play, tmp_path, monkeypatch):
     """Those of a chunk's last update, which none of its losses has seen."""
     lose = lambda net: jax.tree.map(lambda x: x.at[1].set(jnp.nan), net)
     spoil = lambda agent: with_nets(agent, actor=lose(agent.nets["actor"]))
-    check = run.require_finite_parameters
+    check = entries.require_finite_parameters
     late = lambda agent, step, last: check(spoil(agent) if step == 100 else agent, step, last)
-    monkeypatch.setattr(run, "require_finite_parameters", late)
+    monkeypatch.setattr(entries, "require_finite_parameters", late)
     with pytest.raises(FloatingPointError, match=r"before step 100 \(number 1 .*; the last checkpoint is '.*/50'"):
         play(tmp_path)
     assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"50"}

@@ -30,9 +30,10 @@ from mtjax.learning.evaluation import Scores, load_evaluations, save_evaluations
 from mtjax.learning.loop import Settings, TrainState
 from mtjax.names import Notice
 from mtjax.saved.config_json import from_json, to_flags, to_json
-from mtjax.training import memory, stops
-from mtjax.training import run as run_module
-from mtjax.training.run import Hooks, _Progress, _Run
+from mtjax.saved.folder import evaluations_before
+from mtjax.training import entries, memory, stops
+from mtjax.training.journal import Hooks
+from mtjax.training.run import _Progress, _Run, adopted
 from mtjax.types import InputError, Spec
 
 SMALL = {"num_envs": 4, "batch_size": 8, "replay_size": 200, "warmup_steps": 5, "chunk_steps": 20}
@@ -202,7 +203,12 @@ def test_the_evaluation_that_is_told_is_of_the_seeds_that_go_on(capsys):
     run = _Run(of_three_points(eval_episodes=1))
     scores = lambda agent, number: Scores(np.full((3, len(Walk().tasks("all").id), 1), 7.0), {})
     now = _Progress(
-        TrainState(*[None] * len(TrainState._fields)), 20, 0.0, 0.0, run._no_evaluations(), np.zeros(3, bool)
+        TrainState(*[None] * len(TrainState._fields)),
+        20,
+        0.0,
+        0.0,
+        evaluations_before(run.config),
+        np.zeros(3, bool),
     )
     for diverged in ([False, True, False], [True, True, True]):
         found = run._evaluate(scores, now._replace(diverged=np.array(diverged)))
@@ -513,11 +519,10 @@ def test_damaged_evaluations_do_not_stop_a_sweep(swept, tmp_path, capsys):
 
 def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
     """Its losses were still finite. It scores nothing, and the others go on; without any other, nothing is saved."""
-    run = _Run(of_three_points())
+    watch = _Run(of_three_points()).watch
 
     def given_up(actor, *before):
-        state = types.SimpleNamespace(agent=types.SimpleNamespace(nets={"actor": jnp.asarray(actor)[:, None]}))
-        return run._give_up_spoiled(_Progress(state, 120, 0.0, 0.0, None, np.array(before))).diverged.tolist()
+        return watch.before_saving({"actor": jnp.asarray(actor)[:, None]}, 120, np.array(before)).tolist()
 
     assert given_up([0.0, np.nan, 1.0], False, False, True) == [False, True, True]
     assert capsys.readouterr().out.splitlines() == ["seed 0 of tau=0.2 diverged and is given up"]
@@ -529,7 +534,7 @@ def test_a_seed_that_the_last_update_spoiled_is_given_up(capsys):
 def test_a_spoiled_seed_is_not_evaluated(monkeypatch):
     """As it would do nothing, which has a return too."""
     real = stops.finite_seeds
-    monkeypatch.setattr(run_module, "finite_seeds", lambda state: real(state) & [True, False])
+    monkeypatch.setattr(entries, "finite_seeds", lambda state: real(state) & [True, False])
     given = {"steps": 240, "eval_every": 240, "eval_episodes": 2, "sweep": {"actor_lr": [1e-3, 1e-4]}, **SMALL}
     returns = train_objects(Walk(), tiny("sac"), **given).evaluations.returns["train"]
     assert np.isfinite(returns[0]).all() and np.isnan(returns[1]).all()
@@ -578,14 +583,14 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     tasks, sweep = start.env.tasks("train"), {"tau": [0.1, 0.2]}
     config = configured(start.env, start.agent, SMALL, plan={"seeds": 3}, start=start, sweep=sweep)
     run = _Run(config, Hooks(start=start, quiet=True))
-    seeds, numbers = run.seed_axis
+    seeds, numbers = run.entries.axis
     shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, config.training, tasks, seeds, numbers)).agent
     fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(numbers=numbers)
-    state = run.adopt(tasks, fresh)
+    state = adopted(config, run.hooks, run.agent, fresh)
     np.testing.assert_array_equal(state.numbers["tau"], np.float32([0.1] * 3 + [0.2] * 3))
     began = np.asarray(start.states.nets["temperature"].own["log"])
-    adopted = state.nets["temperature"].own["log"]
-    np.testing.assert_array_equal(adopted, began[[0, 1, 0, 0, 1, 0]])
+    taken = state.nets["temperature"].own["log"]
+    np.testing.assert_array_equal(taken, began[[0, 1, 0, 0, 1, 0]])
     assert np.any(began[0] != began[1])
     assert jax.tree.structure(state) == jax.tree.structure(fresh)
 

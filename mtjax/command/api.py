@@ -16,8 +16,8 @@ from mtjax.report.curve import draw
 from mtjax.saved.folder import prepare
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
+from mtjax.training.journal import Hooks
 from mtjax.training.launch import check, launch
-from mtjax.training.run import Hooks
 from mtjax.types import Agent, Env
 
 

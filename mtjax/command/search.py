@@ -28,8 +28,8 @@ from mtjax.saved.folder import evaluations_of, new_directory, short_name
 from mtjax.saved.log import aligned, number, write_table
 from mtjax.training import memory
 from mtjax.training import search as searching
+from mtjax.training.journal import Hooks
 from mtjax.training.launch import check, launch, load_start
-from mtjax.training.run import Hooks
 from mtjax.training.search import Search, Trial
 from mtjax.types import InputError
 

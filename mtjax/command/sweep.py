@@ -31,8 +31,8 @@ from mtjax.saved.config_json import describe_stop, from_json, write_config
 from mtjax.saved.folder import evaluations_of, new_directory, record_steps, resumed_config, short_name
 from mtjax.saved.log import aligned, number, write_table
 from mtjax.training import memory
+from mtjax.training.journal import Hooks
 from mtjax.training.launch import check, launch, load_start
-from mtjax.training.run import Hooks
 from mtjax.types import SPLITS, InputError
 
 _FIXED = ("seed", "seeds", "runs", "resume", "list", "import", "sweep", "from", "preset", "view")

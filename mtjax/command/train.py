@@ -22,8 +22,8 @@ from mtjax.saved.folder import new_directory, record_steps, resumed_config, shor
 from mtjax.saved.result import Result
 from mtjax.training import memory
 from mtjax.training.console import duration
+from mtjax.training.journal import Hooks
 from mtjax.training.launch import check, launch, load_start
-from mtjax.training.run import Hooks
 from mtjax.types import InputError
 
 

@@ -156,14 +156,20 @@ def _entries(record: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for outer, x in record.items() for name, value in inner(outer, x).items()}
 
 
+def evaluations_before(config: RunConfig) -> Evaluations:
+    """Return the evaluations of a run that has not begun."""
+    values = {split: config.family.task_values(split) for split in SPLITS}
+    seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
+    return no_evaluations(seeds, values, config.plan.eval_episodes, config.training.trials)
+
+
 def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
     """Read the evaluations of a run, given its configuration.
 
     Raises:
         InputError: the file is missing or damaged, or of another run.
     """
-    file, values = directory / "evaluations.npz", {split: config.family.task_values(split) for split in SPLITS}
+    file = directory / "evaluations.npz"
     found = load_evaluations(file)
-    seeds = [*config.plan.all_seeds] * max(len(config.points), 1)
-    require_same_run(file, found, no_evaluations(seeds, values, config.plan.eval_episodes, config.training.trials))
+    require_same_run(file, found, evaluations_before(config))
     return found

@@ -24,7 +24,8 @@ from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
 from mtjax.training.distillation import require_teachers
 from mtjax.training.finetune import require_start
-from mtjax.training.run import NO_HOOKS, Hooks, train
+from mtjax.training.journal import NO_HOOKS, Hooks
+from mtjax.training.run import train
 from mtjax.types import InputError
 
 
