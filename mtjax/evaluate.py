@@ -46,7 +46,8 @@ class Request:
     """Score nothing, and show a page on this machine: the run's curves as they come, and its newest policy in worlds
     that move. The number is the page's port; --view alone takes 8008."""
     diagnostics: bool = False
-    """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay."""
+    """Measure conflicts between the tasks' gradients, and unused units of the networks, from the run's replay, or from
+    a rollout that an agent without one plays for that."""
 
     @property
     def drawn(self) -> int | None:

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import shutil
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.flatten_util
@@ -13,12 +14,28 @@ import matplotlib.image
 import numpy as np
 import probes
 import pytest
-from probes import OFF_POLICY, QUICK, learner, of_task, one_in, pick, random_batch, slow_but, tasks_of, tiny, with_nets
+import test_sketches
+from probes import (
+    OFF_POLICY,
+    QUICK,
+    Walk,
+    learner,
+    of_task,
+    one_in,
+    pick,
+    random_batch,
+    slow_but,
+    tasks_of,
+    tiny,
+    with_nets,
+)
 
 import mtjax
 import mtjax.evaluate
+from mtjax.agents import for_action
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.encoders import ENCODERS
+from mtjax.experience.rollouts import windows
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Scores
 from mtjax.report import diagnostics, scoring
@@ -27,7 +44,7 @@ from mtjax.report.diagnostics import Activity, activity, compare_gradients, dorm
 from mtjax.saved import checkpoint, log
 from mtjax.saved.config_json import from_json, to_json
 from mtjax.saved.policy import load_experience
-from mtjax.types import InputError, Spec
+from mtjax.types import Continuous, InputError, Spec
 
 TASKS, BATCH, KEY = tasks_of("one-step", (1.0, -0.5, 0.3)), 8, jax.random.key(5)
 SPEC = Spec.vector(3, 2, 1)
@@ -267,6 +284,91 @@ def test_every_agent_has_diagnostics(name):
     assert gradients["td_error"].shape == (3,)
 
 
+PLAYED = {"ppo": Walk, "impala": Walk, "pqn": partial(mtjax.make, "tabular-mdp"), "sketches": lambda: test_sketches.ENV}
+"""Families of agents that have no replay, from a rollout of which diagnostics are."""
+
+
+def played(agent, env, num_envs=4):
+    """The agent of one seed and the steps (T, H, E, ...) of a rollout that it has played and assessed."""
+    tasks, keys = env.tasks(), jax.random.split(KEY, 1)
+    states = jax.vmap(partial(agent.init, env.spec, tasks))(keys)
+    states, steps = loop.rollout(env, agent, loop.Settings(num_envs=num_envs), tasks, states, keys)
+    return jax.tree.map(lambda x: x[0], (states, steps))
+
+
+@pytest.mark.parametrize("name", slow_but(PLAYED, "pqn", "sketches"))
+def test_agents_without_a_replay_have_diagnostics_of_a_rollout(name):
+    """Of the critic, and of the actor unless the critic chooses. Units inside a map of an agent's own are not seen."""
+    env = PLAYED[name]()
+    agent = for_action(tiny(name, unroll=8, minibatches=2), env.spec.action)
+
+    def look():
+        state, steps = played(agent, env)
+        window = agent.experience.draw(env.spec, agent, steps, KEY, 2)
+        return compare_gradients(agent, state, window, env.tasks(), KEY), activity(agent, state, window, env.tasks())
+
+    gradients, seen = jax.eval_shape(look)
+    networks, count = {"critic"} if name == "pqn" else {"critic", "actor"}, len(env.tasks().id)
+    assert seen.keys() == networks and gradients.keys() == networks | {"td_error"}
+    assert gradients["td_error"].shape == (count,)
+    for network in networks:
+        assert gradients[network]["gradient_norm"].shape == (count,)
+        if (name, network) == ("sketches", "actor"):
+            assert (seen[network].hidden, seen[network].layers) == (None, {})
+            assert utilisation(agent.actor, None, seen[network])["rank"] is None
+        else:
+            assert seen[network].layers and seen[network].hidden.shape[0] == count
+
+
+def test_gradients_of_ppo_are_those_of_the_policy_gradient():
+    """As its first ratio is 1: -mean(A grad log pi) - c grad H; and TD errors are mean |y - V|."""
+    agent = tiny("ppo", hidden=(4,), unroll=6)
+
+    @partial(jax.jit, compiler_options=QUICK)
+    def look():
+        state, steps = played(agent, Walk())
+        tasks, flat = Walk().tasks(), jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), steps)
+        found = compare_gradients(agent, state, windows(steps, 0), tasks, KEY)
+        by_hand = []
+        for i, key in enumerate(jax.random.split(KEY, len(tasks.id))):
+            nets, one, features = of_task(state.nets, i), pick(flat, i), agent.view.features(state, pick(tasks, i))
+            inputs, kept = agent.view.actor_inputs(nets, features, agent.view.see(nets["inputs"], one.obs)), one.extras
+
+            def of_actor(actor, inputs=inputs, kept=kept, key=key):
+                outputs = agent.actor.apply(actor, *inputs)
+                gain = kept.advantage * agent.policy.log_prob(outputs, kept.raw, None)
+                return -jnp.mean(gain) - agent.entropy_cost * jnp.mean(agent.policy.entropy(outputs, None, key))
+
+            def of_critic(critic, inputs=inputs, kept=kept):
+                return jnp.mean((agent.critic.apply(critic, *inputs)[..., 0] - kept.target) ** 2) / 2
+
+            slopes = {"actor": jax.grad(of_actor)(nets["actor"]), "critic": jax.grad(of_critic)(nets["critic"])}
+            by_hand.append({name: jax.flatten_util.ravel_pytree(x.shared)[0] for name, x in slopes.items()})
+        value, units = flat.extras.value, state.nets["units"].own
+        target = units.mean[:, None] + jnp.sqrt(units.variance)[:, None] * flat.extras.target
+        return found, by_hand, jnp.mean(jnp.abs(target - value), axis=1)
+
+    found, by_hand, error = jax.device_get(look())
+    for network in ("actor", "critic"):
+        rows = np.float64([x[network] for x in by_hand])
+        np.testing.assert_allclose(found[network]["gram"], rows @ rows.T, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found["td_error"], error, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["maml", "options", "distil"])
+def test_agents_whose_losses_are_not_of_single_steps_are_refused(name):
+    with pytest.raises(InputError, match=f"(?i)losses of single steps, and those of {name} are not"):
+        diagnostics.with_experience(SimpleNamespace(agent=tiny(name), env=Walk()), "")
+
+
+def test_memories_and_pictures_are_refused():
+    with pytest.raises(InputError, match="learns from windows"):
+        diagnostics.with_experience(SimpleNamespace(agent=tiny("rl2"), env=Walk()), "")
+    shown = SimpleNamespace(spec=Spec({"pixels": jax.ShapeDtypeStruct((64, 64, 3), jnp.uint8)}, Continuous(1), 1))
+    with pytest.raises(InputError, match="networks take vectors"):
+        diagnostics.with_experience(SimpleNamespace(agent=tiny("sac"), env=shown), "")
+
+
 @pytest.mark.parametrize("encoder", one_in(3, ENCODERS))
 def test_units_of_every_encoder_are_seen(encoder):
     """Layers of the right number of networks, all of ReLUs."""
@@ -378,6 +480,20 @@ def test_program_writes_and_prints_diagnostics(name, copied_run, run_of, no_epis
     assert line[1:3] == [f"{found['td_error'][1]:.3g}", f"{found['critic']['gradient_norm'][1]:.3g}"]
 
 
+@pytest.mark.slow
+def test_program_plays_a_rollout_of_an_agent_without_a_replay(short_family, tmp_path, no_episodes, capsys):
+    """And writes and prints the same as for others."""
+    flags = "--env=finger-short --agent=ppo --steps=64 --num-envs=2 --chunk-steps=16 --agent.hidden 8 8"
+    more = f"--agent.unroll=8 --agent.minibatches=2 --eval-episodes=1 --seeds=2 --runs={tmp_path}"
+    mtjax.train.main([*flags.split(), *more.split()])
+    (run,) = tmp_path.iterdir()
+    mtjax.evaluate.main([f"--run={run}", "--diagnostics"])
+    found = json.loads((run / "evaluation-1" / "diagnostics.json").read_text())
+    assert (found["batch_size"], found["seeds"]) == (8, 2) and np.all(np.array(found["td_error"]) > 0)
+    assert 0 < found["actor"]["rank"] <= found["actor"]["width"] == 8
+    assert f"{found['td_error'][1]:.3g}" in capsys.readouterr().out
+
+
 def test_seeds_are_averaged(finished_run):
     """By the same keys for every seed, whichever others are there."""
     policy, (replay, batch_size) = mtjax.load(finished_run), load_experience(finished_run)
@@ -389,7 +505,7 @@ def test_seeds_are_averaged(finished_run):
     assert both.seeds == 2 and not np.array_equal(alone[0].td_error, alone[1].td_error)
     means = jax.tree.map(lambda *x: np.mean(x, axis=0), *alone)
     for network in ("critic", "actor"):
-        jax.tree.map(np.testing.assert_allclose, getattr(both, network), getattr(means, network))
+        jax.tree.map(np.testing.assert_allclose, both.networks[network], means.networks[network])
     np.testing.assert_allclose(both.td_error, means.td_error)
 
 

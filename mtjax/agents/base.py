@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import tyro
 
 from mtjax.agents import combinations, parts
-from mtjax.agents.fit import Fit
+from mtjax.agents.fit import Fit, Losses
 from mtjax.agents.hyperparameters import FLAT, PARTS, kinds_of
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.continual import Continual
@@ -119,6 +120,11 @@ class BaseAgent(abc.ABC):
     """Whether it learns from the policies of other runs, which --from names, instead of going on with theirs."""
     distils: ClassVar[bool] = False
     """Whether another policy than each task's own learns beside it."""
+    num_critics: ClassVar[int] = 0
+    """Number of critics that see actions; 0 if the agent has one, which sees none."""
+    losses: ClassVar[Callable[..., Losses] | None] = None
+    """Returns the losses on windows (T, B, L, ...) of a state, for ``tasks`` and a key; None if they do not tell how it
+    learns, so that diagnostics refuse it."""
     unit_head: ClassVar[bool] = False
     """Whether the weights of each output of actor and critics keep length 1."""
     hidden: tuple[int, ...] = (256, 256)

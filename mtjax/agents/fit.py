@@ -21,6 +21,14 @@ class Fitted(NamedTuple):
     metrics: Metrics  # of the conflict between tasks
 
 
+class Losses(NamedTuple):
+    """Holds the losses of an agent's fits on one batch, by which diagnostics look at it."""
+
+    nets: Nets  # of all tasks, as the losses see them
+    by_fit: dict[str, tuple[Callable, tuple]]  # a loss of one task, whose aux are metrics, and data (T, ...)
+    batch: Any  # (T, B, ...) with ``obs`` and ``features``, and ``action`` where critics see it
+
+
 class Problem(NamedTuple):
     """Holds a loss as a function of those networks alone that learn."""
 

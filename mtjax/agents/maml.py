@@ -81,6 +81,8 @@ class MAML(OnPolicy):
     """Take inner steps as constants in the outer one, so that nothing is differentiated twice."""
     experience: Annotated[AdaptingRollouts, FLAT] = dataclasses.field(default_factory=AdaptingRollouts)
 
+    losses = None
+
     def __post_init__(self):
         super().__post_init__()
         parts.require_positive(self, "clip_range", "inner_rate")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import critics, parts, unit_resets
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.fit import Fit, Losses, above, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy
@@ -59,6 +59,28 @@ class Batch(NamedTuple):
     next_obs: Any = None  # (B, O)
     model_targets: Any = None  # targets of its models
     followed: None = None  # as a rollout keeps what followed every step
+
+
+def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
+    """Return the losses of actor and critic on windows (T, B, L, ...) of a rollout that the agent has assessed."""
+    state, batch = agent.prepare(state, window, tasks)
+    error = jnp.mean(jnp.abs(critics.Units.of(state).rewards(batch.target) - batch.value), axis=1)
+
+    def critic_loss(nets: Nets, batch: Batch, error: Array) -> tuple[Array, Metrics]:
+        return agent.critic_loss(nets, batch)[0], {"td_error": error}
+
+    least = agent.least_loss + agent.representation.least_loss
+    critic = above(least, critic_loss), (with_models(agent, state, batch, key), error)
+    actor = agent.actor_loss, (batch, jax.random.split(key, state.num_tasks))
+    return Losses(state.nets, {"critic": critic, "actor": actor}, batch)
+
+
+def with_models(agent: Any, state: AgentState, batch: Batch, key: Key) -> Batch:
+    """Return a batch (T, B, ...) with targets of the representation's models, if it learns."""
+    if not agent.representation.learns:
+        return batch
+    both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
+    return batch._replace(model_targets=agent.representation.targets(*both, batch.next_obs, models_key)[0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,6 +152,8 @@ class OnPolicy(BaseAgent):
                 raise InputError(
                     f"{flag}={given[name]} is of updates from a replay, and {agent} has none; leave it out"
                 )
+
+    losses = losses_of
 
     # Networks.
 
@@ -210,11 +234,8 @@ class OnPolicy(BaseAgent):
         data = (batch, jax.random.split(sample_key, len(tasks.id)))
         moved, actor = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance)
         state = self.accept(moved, state, actor.aux.kl)
-        if self.representation.learns:
-            both, models_key = (state.nets["representation"], state.slow["representation"]), jax.random.fold_in(key, 3)
-            batch = batch._replace(model_targets=self.representation.targets(*both, batch.next_obs, models_key)[0])
         loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
-        batch = self.view.keyed(batch, jax.random.fold_in(key, 4))
+        batch = self.view.keyed(with_models(self, state, batch, key), jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         state = unit_resets.renew(self, state, batch, jax.random.fold_in(key, 5), number)
         metrics = critic.aux | critic.metrics | actor.aux.metrics | actor.metrics

@@ -119,6 +119,8 @@ class Options(OnPolicy):
     keep_options: bool = False
     """Leave sub-policies and terminations as they are, and learn to choose among them."""
 
+    losses = None
+
     def __post_init__(self):
         super().__post_init__()
         parts.require_positive(self, "clip_range")

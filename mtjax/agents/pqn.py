@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import parts
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.fit import Fit, descend
+from mtjax.agents.fit import Fit, Losses, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.parts import targets
@@ -138,11 +138,18 @@ class PQN(BaseAgent):
         self, state: AgentState, window: Transition, tasks: Task, key: Key, number: Array
     ) -> tuple[AgentState, Metrics]:
         """Take a gradient step on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
-        flat, features, obs, _ = self.view.steps(state, window, tasks)
-        batch = Batch(obs, flat.action, flat.extras, features)
-        batch = self.view.keyed(batch, jax.random.fold_in(key, 1))
+        batch = self.view.keyed(self.batch(state, window, tasks), jax.random.fold_in(key, 1))
         state, fitted = descend(self.fits, "critic", state, self.loss, (batch,), key)
         return state, fitted.aux | fitted.metrics | {"epsilon": jnp.broadcast_to(self.share(state), len(tasks.id))}
+
+    def batch(self, state: AgentState, window: Transition, tasks: Task) -> Batch:
+        """Return the batch (T, ...) for the loss, of windows (T, B, L, ...) with their targets."""
+        flat, features, obs, _ = self.view.steps(state, window, tasks)
+        return Batch(obs, flat.action, flat.extras, features)
+
+    def losses(self, state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
+        batch = self.batch(state, window, tasks)
+        return Losses(state.nets, {"critic": (self.loss, (batch,))}, batch)
 
     def loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:
         values = self.q(nets, batch.features, batch.obs)

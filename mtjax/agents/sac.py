@@ -71,6 +71,8 @@ class SAC(BaseAgent):
         super().__post_init__()
         combinations.check_replayed(self)
 
+    losses = replay_batches.losses
+
     # Networks.
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:

@@ -39,7 +39,7 @@ def renew(agent: Any, state: AgentState, batch: Any, key: Key, number: Array) ->
 
 
 def _renew(agent: Any, batch: Any, key: Key, state: AgentState) -> AgentState:
-    actions = () if not hasattr(agent, "num_critics") else (batch.action,)
+    actions = (batch.action,) if agent.num_critics else ()
     seen = {
         "actor": over_tasks(agent.view.actor_inputs, state.nets, batch.features, batch.obs),
         "critic": (*over_tasks(agent.view.critic_inputs, state.nets, batch.features, batch.obs), *actions),

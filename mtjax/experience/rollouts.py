@@ -105,7 +105,7 @@ class Rollouts:
         return order[:, : size * self.minibatches].reshape(-1, size)
 
     def draw(self, spec: Spec, agent: Any, steps: Transition, key: Key, count: int) -> Transition:
-        """Draw ``count`` windows (T, count, L, ...) of every task, as long as the agent needs them, of (T, H, E, ...)."""
+        """Draw ``count`` windows (T, count, L, ...) of every task, as long as the agent needs, of (T, H, E, ...)."""
         flat = windows(steps, agent.unroll)
         return jax.tree.map(lambda x: x[:, jax.random.randint(key, (count,), 0, x.shape[1])], flat)
 

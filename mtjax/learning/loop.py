@@ -203,9 +203,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
         state, steps, seen = _collect(env, agent, settings, tasks, state, act_key, reset_key)
-        assess = lambda learner, steps: at_point(agent, learner).assess(learner, steps, tasks)
         observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
-        learners, steps = over_seeds(assess, 0, 0)(_of_played(state.agent, state.rows), steps)
+        learners, steps = over_seeds(partial(_assess, agent, tasks), 0, 0)(_of_played(state.agent, state.rows), steps)
         data = experience.add(state.data, steps)
         learners, losses, learned = _learn(env, agent, settings, tasks, learners, data, state.iteration, learn_key)
         learners = over_seeds(observe, 0, 0)(learners, steps)
@@ -341,6 +340,27 @@ def _collect(
     state, (steps, seen) = jax.lax.scan(play, state, (jnp.arange(adaptations + 1) == adaptations, *apart))
     joined = lambda x: jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], count, *x.shape[4:])
     return state, jax.tree.map(joined, steps), jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), seen)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def rollout(
+    env: Env, agent: Agent, settings: Settings, tasks: Task, learners: Any, keys: Key
+) -> tuple[Any, Transition]:
+    """Let agents (S, ...) play ``tasks`` (T, ...) in fresh worlds, with keys (S,), for as long as before they learn.
+
+    Returns:
+        the agents, which have assessed the steps, and these, leaves (S, T, H, E, ...).
+    """
+    begin_keys, act_keys, reset_keys = split_keys(keys, 3)
+    shape = len(keys), len(tasks.id), settings.num_envs
+    worlds = _first_worlds(env, agent, settings, learners, tasks, world_keys(begin_keys, shape))
+    state = TrainState(learners, worlds, jnp.zeros(shape), worlds.age == 0, (), jnp.int32(0), keys)
+    steps = _collect(env, agent, settings, tasks, state, act_keys, reset_keys)[1]
+    return over_seeds(partial(_assess, agent, tasks), 0, 0)(learners, steps)
+
+
+def _assess(agent: Agent, tasks: Task, learner: Any, steps: Transition) -> tuple[Any, Transition]:
+    return at_point(agent, learner).assess(learner, steps, tasks)
 
 
 def _with_first(steps: Transition, begun: Any) -> Transition:

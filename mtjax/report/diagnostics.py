@@ -1,10 +1,12 @@
 """Diagnostics of a trained agent: conflicts between its tasks' gradients, and the use of its networks' units.
 
-They use the training tasks, the agent and the replay of a run's last checkpoint, and fixed random keys. Gradients are
-those of the agent's own losses for each task alone, without the rule that combined them in training and without task
-weights. Cosines are over shared parameters only, because tasks cannot conflict over parameters of their own.
+They use the training tasks, the agent and the replay of a run's last checkpoint, or a rollout that an agent without one
+plays then, and fixed random keys. Gradients are those of the agent's own losses for each task alone, without the rule
+that combined them in training and without task weights. Cosines are over shared parameters only, because tasks cannot
+conflict over parameters of their own.
 """
 
+import dataclasses
 import json
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -18,15 +20,14 @@ import numpy as np
 from jax.extend.core import get_opaque_trace_state
 
 from mtjax import frames
-from mtjax.agents import SAC
-from mtjax.agents.fit import Problem, above
+from mtjax.agents.fit import Problem
 from mtjax.agents.networks import Network, Params, ReLU
 from mtjax.agents.parts.gradients import surgery
-from mtjax.agents.replay_batches import critic_data, prepare
 from mtjax.agents.state import Nets, axes_of
-from mtjax.experience.ring import Ring
+from mtjax.learning import loop
 from mtjax.report import figures
-from mtjax.saved.policy import Policy
+from mtjax.saved.config_json import from_json
+from mtjax.saved.policy import Policy, load_experience
 from mtjax.types import Array, Env, InputError, Key, Task, Transition
 
 DRAWS = 16
@@ -40,7 +41,10 @@ HELD = 0.99
 
 
 class Findings(NamedTuple):
-    """Diagnostics of the critics or of the actor, averaged over seeds (and critics)."""
+    """Diagnostics of the critics or of the actor, averaged over seeds (and critics).
+
+    Those of units are None where networks are applied inside a map of the agent's own.
+    """
 
     gram: Any  # (T, T) inner products of the tasks' gradients on shared parameters; None if there are none
     cosine: Any  # (T, T) their cosines, or None
@@ -56,79 +60,99 @@ class Findings(NamedTuple):
 class Diagnostics(NamedTuple):
     """Diagnostics of an agent."""
 
-    critic: Findings
-    actor: Findings
+    networks: dict[str, Findings]  # "critic", and "actor" unless the critic is the policy
     td_error: Any  # (T,) mean |Q - target|, in the units of the rewards that the critics learn from
     batch_size: int
     seeds: int
 
 
-def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
+def with_experience(policy: Policy, directory: str | Path, point: int = 0) -> tuple[Policy, Any, int]:
+    """Return what ``diagnose`` takes of a run: the policy, what it learns from, and its batches' size.
+
+    An agent without a replay plays a rollout for that, and assesses it.
+
+    Args:
+        point: as ``seed`` of ``mtjax.load``.
+
+    Raises:
+        InputError: there are no diagnostics of such an agent, or no data.
+    """
+    agent, name = policy.agent, type(policy.agent).__name__
+    if frames.shown(policy.env.spec.obs):
+        raise InputError("diagnostics are of agents whose networks take vectors")
+    if agent.losses is None:
+        raise InputError(f"diagnostics are of agents with losses of single steps, and those of {name} are not")
+    if agent.conditioning.recurs:
+        raise InputError("diagnostics look at single transitions, and this conditioning learns from windows")
+    if agent.experience.storage.kept:
+        return policy, *load_experience(directory, point)
+    settings, tasks = from_json(Path(directory) / "config.json").training, policy.env.tasks("train")
+    keys = jax.random.split(jax.random.key(0), len(policy.seeds))
+    states, steps = loop.rollout(policy.env, agent, settings, tasks, policy.states, keys)
+    size = settings.num_envs * agent.experience.steps // agent.experience.minibatches
+    return dataclasses.replace(policy, states=states), steps, size
+
+
+def diagnose(policy: Policy, data: Any, batch_size: int) -> Diagnostics:
     """Return the diagnostics of a policy, averaged over its seeds.
 
     Args:
-        replay: rows (S, T, H, E, ...).
+        data: a replay with rows (S, T, H, E, ...), or a rollout with such leaves, as of ``with_experience``.
         batch_size: transitions of a task in each batch. The run's own size gives the gradient norms of training.
 
     Raises:
-        InputError: the replay is empty, or the agent has no critics of actions.
+        InputError: the replay is empty.
     """
-    if frames.shown(policy.env.spec.obs):
-        raise InputError("diagnostics are of agents whose networks take vectors")
-    if int(replay.size) < getattr(policy.agent.experience, "n_step", 1):
-        raise InputError("the replay of this run is empty; train it for longer")
     tasks, agent = policy.env.tasks("train"), policy.agent
-    if not isinstance(agent, SAC):
-        raise InputError(f"diagnostics are of SAC and agents made from it, not of {type(agent).__name__}")
-    if agent.unroll:
-        raise InputError("diagnostics look at single transitions, and this conditioning learns from windows")
+    kept = agent.experience.storage.kept
+    if kept and int(data.size) < agent.experience.n_step:
+        raise InputError("the replay of this run is empty; train it for longer")
     found = []
     for s in range(len(policy.seeds)):
-        state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, replay.rows))
+        state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, data.rows if kept else data))
         gradient_key, sample_key = jax.random.split(jax.random.key(0))
-        of_seed = replay._replace(rows=rows)
+        of_seed = data._replace(rows=rows) if kept else rows
         gradients = _average_gradients(policy.env, agent, state, of_seed, tasks, gradient_key, batch_size)
         activity = _sample_activity(policy.env, agent, state, of_seed, tasks, sample_key)
         found.append(_summarise(agent, state, gradients, activity))
-    critic, actor, td_error = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
-    critic, actor = (x._replace(width=int(x.width)) for x in (critic, actor))
-    return Diagnostics(critic, actor, td_error, batch_size, len(found))
+    networks, td_error = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
+    networks = {name: x._replace(width=int(x.width)) for name, x in networks.items()}
+    return Diagnostics(networks, td_error, batch_size, len(found))
 
 
-def _summarise(agent: SAC, state: Any, gradients: Mapping, activity: Mapping) -> tuple[Findings, Findings, np.ndarray]:
-    of = lambda name, network, params: Findings(
-        **jax.device_get(gradients[name]), **utilisation(network, params, jax.device_get(activity[name]))
-    )
-    critic, actor = (of(x, getattr(agent, x), state.nets[x]) for x in ("critic", "actor"))
-    return critic, actor, np.asarray(gradients["td_error"])
+def _summarise(agent: Any, state: Any, gradients: dict, activity: Mapping) -> tuple[dict[str, Findings], np.ndarray]:
+    td_error, network = np.asarray(gradients.pop("td_error")), {"critic": agent.critic, "actor": agent.actor}
+    units = {name: utilisation(network[name], state.nets[name], jax.device_get(activity[name])) for name in gradients}
+    return {name: Findings(**jax.device_get(x), **units[name]) for name, x in gradients.items()}, td_error
 
 
 # Gradients.
 
 
 @partial(jax.jit, static_argnums=(0, 1, 6))
-def _average_gradients(env: Env, agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key, batch_size: int) -> dict:
+def _average_gradients(env: Env, agent: Any, state: Any, data: Any, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
-        window = agent.experience.draw(env.spec, agent, replay, batch_key, batch_size)
+        window = _draw(env, agent, data, batch_key, batch_size)
         return compare_gradients(agent, state, window, tasks, loss_key)
 
     return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))
 
 
-def compare_gradients(agent: SAC, state: Any, window: Transition, tasks: Task, key: Key) -> dict[str, Any]:
+def _draw(env: Env, agent: Any, data: Any, key: Key, count: int) -> Transition:
+    """Draw windows (T, B, L, ...) of ``count`` transitions of every task together."""
+    return agent.experience.draw(env.spec, agent, data, key, max(count // max(agent.unroll, 1), 1))
+
+
+def compare_gradients(agent: Any, state: Any, window: Transition, tasks: Task, key: Key) -> dict[str, Any]:
     """Differentiate the agent's losses on windows (T, B, L, ...) for each task alone.
 
     Returns:
         "critic" and "actor": gram, cosine, conflict and gradient_norm, as in ``Findings``; "td_error" (T,).
     """
-    target_key, actor_key = jax.random.split(key)
-    seen = prepare(agent, state, window, tasks)
-    least, data = agent.least_loss + agent.representation.least_loss, critic_data(agent, state, seen, target_key)
-    critic, aux = _compare(agent.fits["critic"].problem(above(least, agent.critic_loss), state.nets, data))
-    data = (seen, jax.random.split(actor_key, state.num_tasks))
-    actor, _ = _compare(agent.fits["actor"].problem(agent.actor_loss, state.nets, data))
-    return {"critic": critic, "actor": actor, "td_error": aux.metrics["td_error"]}
+    nets, by_fit, _ = agent.losses(state, window, tasks, key)
+    found = {name: _compare(agent.fits[name].problem(loss, nets, data)) for name, (loss, data) in by_fit.items()}
+    return {name: x for name, (x, _) in found.items()} | {"td_error": found["critic"][1]["td_error"]}
 
 
 def _compare(problem: Problem) -> tuple[dict[str, Any], Any]:
@@ -150,33 +174,35 @@ class Activity(NamedTuple):
     """Outputs of a network's units. For a single transition there are no leading axes."""
 
     layers: dict[str, Any]  # (..., units) of each layer of ReLUs
-    hidden: Any  # (..., width), the layer on which heads stand
+    hidden: Any  # (..., width), the layer on which heads stand; None where it is inside a map
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _sample_activity(env: Env, agent: SAC, state: Any, replay: Ring, tasks: Task, key: Key) -> dict[str, Activity]:
-    return activity(agent, state, agent.experience.draw(env.spec, agent, replay, key, SAMPLE), tasks)
+def _sample_activity(env: Env, agent: Any, state: Any, data: Any, tasks: Task, key: Key) -> dict[str, Activity]:
+    return activity(agent, state, _draw(env, agent, data, key, SAMPLE), tasks)
 
 
-def activity(agent: SAC, state: Any, window: Transition, tasks: Task) -> dict[str, Activity]:
+def activity(agent: Any, state: Any, window: Transition, tasks: Task) -> dict[str, Activity]:
     """Return the activity of "critic" and "actor" on windows (T, B, L, ...). A representation counts as the actor's.
 
     Returns:
-        mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor.
+        mean activity over the batch (T, N, units), and hidden layers (T, B, N, width); N is 1 for the actor, and for a
+        critic that sees no actions.
     """
-    seen_batch = prepare(agent, state, window, tasks)
-    given, shape = seen_batch.features, (*seen_batch.reward.shape, seen_batch.features.shape[-1])
+    nets, by_fit, batch = agent.losses(state, window, tasks, jax.random.key(0))
+    given, shape = batch.features, (*jax.tree.leaves(batch.obs)[0].shape[:2], batch.features.shape[-1])
     features = jnp.broadcast_to(given if given.ndim == 3 else given[:, None], shape)
+    actions, alone = (batch.action,) if agent.num_critics else (), partial(jax.tree.map, lambda x: x[None])
 
-    def one(nets: Nets, features: Array, obs: Array, action: Array) -> dict[str, Activity]:
-        known, inputs = agent.view.critic_inputs(nets, features, obs)
-        judge = partial(watch, agent.critic.apply)
-        judging = jax.vmap(judge, (0, None, None, None))(nets["critic"], known, inputs, action)
-        acting = watch(agent.policy_outputs, nets, features, obs)
-        return {"critic": judging, "actor": jax.tree.map(lambda x: x[None], acting)}
+    def one(nets: Nets, features: Array, obs: Array, *action: Array) -> dict[str, Activity]:
+        inputs = (*agent.view.critic_inputs(nets, features, obs), *action)
+        critics = nets["critic"] if action else alone(nets["critic"])
+        found = {"critic": jax.vmap(lambda net: watch(agent.critic.apply, net, *inputs))(critics)}
+        return found | ({"actor": alone(watch(agent.policy_outputs, nets, features, obs))} if "actor" in by_fit else {})
 
-    every = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (axes_of(state.nets), 0, 0, 0))
-    seen = every(state.nets, features, seen_batch.obs, seen_batch.action)
+    rows = features, batch.obs, *actions
+    every = jax.vmap(jax.vmap(one, (None, *[0] * len(rows))), (axes_of(nets), *[0] * len(rows)))
+    seen = every(nets, *rows)
     level = lambda x: jnp.mean(jnp.abs(x), axis=1).reshape(*x.shape[:1], x.shape[2], -1)
     return {name: Activity(jax.tree.map(level, x.layers), x.hidden) for name, x in seen.items()}
 
@@ -201,16 +227,19 @@ def watch(function: Callable, *arguments: Any) -> Activity:
             layers[f"{name}:{len(layers)}" if name in layers else name] = output
         if first:
             outermost.clear()
+        if first and get_opaque_trace_state() == outside:
             outputs.append(output)
         return output
 
     with nn.intercept_methods(note):
         function(*arguments)
-    return Activity(layers, outputs[-1])
+    return Activity(layers, outputs[-1] if outputs else None)
 
 
 def utilisation(network: Network, params: Params, seen: Activity) -> dict[str, Any]:
     """Return dormant units and effective ranks, as in ``Findings``, from the result of ``activity``."""
+    if seen.hidden is None:
+        return {"dormant": None, "dormant_by_layer": {}, "rank": None, "entropy_rank": None, "width": 0}
     disjoint, front = "body" in params.own, type(network.front).__name__
     by_layer, units = {}, {}
     for name, levels in seen.layers.items():
@@ -261,20 +290,22 @@ def table(policy: Policy, found: Diagnostics) -> str:
         f"training tasks, {DRAWS} batches of {found.batch_size} transitions of each:",
         f"{'network':10} {'cosine':>7} {'conflict':>9} {'dormant':>8}   effective rank",
     ]
-    for name, x in (("critic", found.critic), ("actor", found.actor)):
-        cosine, conflict = "-", "-"
+    for name, x in found.networks.items():
+        cosine, conflict, dormant, rank = "-", "-", "-", "-"
         if x.cosine is not None and len(x.cosine) > 1:
             cosine, conflict = f"{mean_cosine(x.cosine):.2f}", f"{x.conflict:.0%}"
-        lines.append(f"{name:10} {cosine:>7} {conflict:>9} {x.dormant:>8.1%}   {x.rank:.0f} of {x.width}")
-    for name, x in (("critic", found.critic), ("actor", found.actor)):
+        if x.rank is not None:
+            dormant, rank = f"{x.dormant:.1%}", f"{x.rank:.0f} of {x.width}"
+        lines.append(f"{name:10} {cosine:>7} {conflict:>9} {dormant:>8}   {rank}")
+    for name, x in found.networks.items():
         if x.cosine is None:
             lines.append(f"tasks share no parameters of the {name}, over which they could conflict")
     labels = policy.env.labels("train")
     width = max(10, *map(len, labels))
-    lines.append(f"{policy.env.task_axis[0]:>{width}} {'TD error':>9} {'critic gradient':>16} {'actor gradient':>15}")
-    rows = zip(found.td_error, found.critic.gradient_norm, found.actor.gradient_norm, strict=True)
-    for label, (error, critic, actor) in zip(labels, rows, strict=True):
-        lines.append(f"{label:>{width}} {error:9.3g} {critic:16.3g} {actor:15.3g}")
+    columns = {f"{name} gradient": x.gradient_norm for name, x in found.networks.items()}
+    lines.append(" ".join([f"{policy.env.task_axis[0]:>{width}} {'TD error':>9}", *(f"{x:>16}" for x in columns)]))
+    for label, error, *lengths in zip(labels, found.td_error, *columns.values(), strict=True):
+        lines.append(" ".join([f"{label:>{width}} {error:9.3g}", *(f"{x:16.3g}" for x in lengths)]))
     return "\n".join(lines)
 
 
@@ -290,8 +321,9 @@ def write(policy: Policy, found: Diagnostics, directory: Path) -> None:
     values = policy.env.task_values("train")
     tasks = policy.env.labels("train")
     record = {"parameter": name, "unit": unit, "values": values, "tasks": tasks, "draws": DRAWS, "sample": SAMPLE}
-    networks = {"critic": found.critic._asdict(), "actor": found.actor._asdict()}
-    record = _plain({**record, **found._asdict(), **networks})
+    networks = {who: x._asdict() for who, x in found.networks.items()}
+    of_run = {"td_error": found.td_error, "batch_size": found.batch_size, "seeds": found.seeds}
+    record = _plain({**record, **networks, **of_run})
     (directory / "diagnostics.json").write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
     cosines = {who: x["cosine"] for who, x in networks.items()}
     bars = {f"length of the {who}'s gradient": x["gradient_norm"] for who, x in networks.items()}

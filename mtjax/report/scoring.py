@@ -27,7 +27,7 @@ from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json
 from mtjax.saved.export import export
 from mtjax.saved.log import append_rows, number
-from mtjax.saved.policy import Policy, load, load_experience
+from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
 from mtjax.saved.tables import pandas
 from mtjax.types import SPLITS, InputError, Task
@@ -168,7 +168,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         films.require(policy.env)
     if request.export:
         print(f"exported to {export(policy, request.export)}", flush=True)
-    found = diagnostics.diagnose(policy, *load_experience(run, first)) if request.diagnostics else None
+    found = diagnostics.diagnose(*diagnostics.with_experience(policy, run, first)) if request.diagnostics else None
     trained = policy.env
     policy, tasks, named = with_tasks(policy, vary, request.drawn)
     if vary:

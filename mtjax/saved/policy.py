@@ -21,7 +21,6 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.contexts import ranges
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import FamilyOrMixture
-from mtjax.experience import Replay
 from mtjax.experience.ring import Ring
 from mtjax.learning import loop
 from mtjax.names import public
@@ -274,11 +273,9 @@ def load_experience(directory: str | Path, seed: int = 0) -> tuple[Ring, int]:
     For a run of a sweep, return the replay of all seeds of one point. ``seed`` chooses the point as in ``load``.
 
     Raises:
-        InputError: as for ``load``; or the run has no replay.
+        InputError: as for ``load``.
     """
     config = from_json(Path(directory) / "config.json")
-    if not isinstance(config.learner.experience, Replay):
-        raise InputError(f"{config.agent} keeps no replay, so that there is nothing to look at")
     ring = checkpoints.load_ring(Path(directory) / "checkpoints", state_shapes(config))
     rows = slice(seed, seed + 1) if config.plan.rule else _point_rows(config.plan.seeds, seed)
     return ring._replace(rows=jax.tree.map(lambda x: x[rows], ring.rows)), config.learner.experience.batch_size
