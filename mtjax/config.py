@@ -432,7 +432,7 @@ def _preset_files(env_name: str) -> list[str]:
 
 
 def _sees_pictures(family: FamilyOrMixture) -> bool:
-    return any(getattr(part.family, "pixels", 0) for part in family.parts)
+    return any(part.family.pixels for part in family.parts)
 
 
 def _device_preset() -> str:

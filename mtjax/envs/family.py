@@ -61,6 +61,7 @@ class Family(abc.ABC):
     fresh_goals: ClassVar[bool] = False  # every episode draws a goal of its own, whatever its task
     looks: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})  # parameters that change only what is seen
     repeat: ClassVar[int] = 1  # control steps in a step
+    pixels: ClassVar[int] = 0  # on each side of the pictures that agents observe; 0 if they see none
     frames: ClassVar[int] = 1  # how many of the last pictures an agent sees at once, if it observes pictures
     ends_early: ClassVar[bool] = True  # whether episodes may end before their limit; it decides how resets are computed
     films: ClassVar[bool] = False  # whether its worlds can be seen in films
