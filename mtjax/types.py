@@ -328,10 +328,6 @@ class Experience(Protocol):
     storage: ClassVar[Storage]
 
     @property
-    def batch_size(self) -> int: ...  # transitions of each task in an update; 0: a share of those collected
-    @property
-    def hindsight(self) -> float: ...  # the share of what is learned from that is relabelled as another task's
-    @property
     def steps(self) -> int: ...  # of every environment that are collected before the agent learns
     @property
     def adaptations(self) -> int: ...  # how often the agent adapts meanwhile: between as many rollouts and one more
@@ -358,7 +354,6 @@ class Experience(Protocol):
 class Agent(Protocol):
     """An agent acts and learns. It is a frozen dataclass; its fields are hyper-parameters and command-line flags."""
 
-    lr_schedule: Any  # how learning rates change over a run, "constant" if they do not
     continual: ClassVar[Any]  # the part that remembers tasks learned one after another: ``agents.parts.continual``
     plasticity: ClassVar[Any]  # the part that keeps networks able to learn: ``agents.parts.plasticity``
     goes_on: ClassVar[bool]  # whether its memory holds an option that runs, ``memory.running.option``

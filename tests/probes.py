@@ -152,7 +152,6 @@ class Stub:
     experience: Replay = dataclasses.field(default_factory=Replay)
 
     unroll: ClassVar[int] = 0
-    lr_schedule: ClassVar[str] = "constant"
     continual: ClassVar[Continual] = Continual()
     plasticity: ClassVar[Plasticity] = Plasticity()
     goes_on: ClassVar[bool] = False

@@ -35,6 +35,7 @@ import mtjax.evaluate
 from mtjax.agents import for_action
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.encoders import ENCODERS
+from mtjax.agents.state import of_task as state_of_task
 from mtjax.experience.rollouts import windows
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Scores
@@ -325,13 +326,13 @@ def test_gradients_of_ppo_are_those_of_the_policy_gradient():
     agent = tiny("ppo", hidden=(4,), unroll=6)
 
     @partial(jax.jit, compiler_options=QUICK)
-    def look():
-        state, steps = played(agent, Walk())
-        tasks, flat = Walk().tasks(), jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), steps)
+    def look(state, steps, tasks):
+        flat = jax.tree.map(lambda x: x.reshape(len(x), -1, *x.shape[3:]), steps)
         found = compare_gradients(agent, state, windows(steps, 0), tasks, KEY)
         by_hand = []
         for i, key in enumerate(jax.random.split(KEY, len(tasks.id))):
-            nets, one, features = of_task(state.nets, i), pick(flat, i), agent.view.features(state, pick(tasks, i))
+            (one, task), nets = jax.tree.map(lambda x, i=i: x[i], (flat, tasks)), state_of_task(state.nets, i)
+            features = agent.view.features(state, task)
             inputs, kept = agent.view.actor_inputs(nets, features, agent.view.see(nets["inputs"], one.obs)), one.extras
 
             def of_actor(actor, inputs=inputs, kept=kept, key=key):
@@ -348,7 +349,7 @@ def test_gradients_of_ppo_are_those_of_the_policy_gradient():
         target = units.mean[:, None] + jnp.sqrt(units.variance)[:, None] * flat.extras.target
         return found, by_hand, jnp.mean(jnp.abs(target - value), axis=1)
 
-    found, by_hand, error = jax.device_get(look())
+    found, by_hand, error = jax.device_get(look(*played(agent, Walk()), Walk().tasks()))
     for network in ("actor", "critic"):
         rows = np.float64([x[network] for x in by_hand])
         np.testing.assert_allclose(found[network]["gram"], rows @ rows.T, rtol=1e-3, atol=1e-5)

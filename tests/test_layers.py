@@ -195,15 +195,16 @@ def test_a_class_is_read_with_few_others():
 
 # The protocols: what is read of agents, environments and experiences, by the names that these have.
 READ = {
-    types.Env: ("env", "self.config.family"),
+    types.Env: ("env", "self.config.family", "config.family"),
     types.Agent: ("agent", "self.agent", "at_point(agent, learner)", "with_numbers(agent, numbers)"),
     types.Experience: ("experience", "self.experience", "agent.experience", "self.agent.experience"),
 }
-READERS = ("learning", "compiling", "parallel.axes", "training.run", "training.memory", "training.host_replay")
+_RUN = ("training.run", "training.journal", "training.memory", "training.host_replay")
+READERS = ("learning", "compiling", "parallel.axes", "saved.folder", *_RUN)
 KNOWN = {  # where it is known which class it is
     types.Env: {"calls", "relabels", "varied", "fresh_goals", "observe_worlds", "returning", "distance"},
     types.Agent: {"adapt", "conditioning", "gradients", "heads", "representation", "view"},
-    types.Experience: {"capacity", "n_step"},
+    types.Experience: {"capacity", "hindsight", "n_step"},
 }
 
 

@@ -26,7 +26,7 @@ def planned(agent: A, steps: int) -> A:
         InputError: the run ends before the schedule's warm-up does.
     """
     own: Any = agent
-    if own.lr_schedule == "constant":
+    if getattr(own, "lr_schedule", "constant") == "constant":  # agents of other kinds have none
         return agent
     each, warmup = own.experience.steps, own.experience.warmup_steps
     updates = own.lr_updates or own.experience.updates * max(steps // each - warmup // each, 0)

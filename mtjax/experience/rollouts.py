@@ -34,7 +34,6 @@ class Rollouts:
     reset_every: ClassVar[int] = 0  # networks are never reset
     warmup_steps: ClassVar[int] = 0  # no action is random before learning
     adaptations: ClassVar[int] = 0  # the policy stays as it is while it plays
-    batch_size: ClassVar[int] = 0  # a share of the steps that are collected
     hindsight: ClassVar[float] = 0.0  # no step is relabelled
 
     def __post_init__(self):

@@ -91,7 +91,7 @@ def _require_one_replay(settings: Settings, agent: Any) -> None:
 def _require_repeatable(trials: int, agent: Agent) -> None:
     """Refuse an agent that takes what follows a step for a state of the same episode."""
     follows = f"what follows a step, which in a trial of {trials} episodes may be another episode"
-    if agent.experience.hindsight:
+    if agent.experience.storage.kept and agent.experience.hindsight:
         raise InputError(f"hindsight relabels steps by {follows}; use --hindsight=0 or --trials=1")
     if not isinstance(agent, BaseAgent):
         return

@@ -129,9 +129,10 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
 def _sizes(config: RunConfig) -> str:
     """Return a line on how many worlds and transitions of a batch a task has, and all tasks together."""
     count, experience = config.played_tasks, config.learner.experience
-    sizes = {"worlds": config.training.num_envs, "transitions in a batch": experience.batch_size}
+    sizes = {"worlds": config.training.num_envs}
+    sizes |= {"transitions in a batch": experience.batch_size} if experience.storage.kept else {}
     told = lambda size: f"{size:,}" if count == 1 else f"{size:,} a task, {count * size:,} in all"
-    return "; ".join(f"{name}: {told(size)}" for name, size in sizes.items() if size)
+    return "; ".join(f"{name}: {told(size)}" for name, size in sizes.items())
 
 
 def slow_on_cpu(config: RunConfig) -> dict[str, str]:
