@@ -227,7 +227,7 @@ def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
     """
     made, rates = [], []
     monkeypatch.setattr(journal, "Clock", lambda *given: made.append((given, Clock(*given))) or made[-1][1])
-    monkeypatch.setattr(run.Console, "progress", lambda console, steps, passed, rate, *_: rates.append(rate))
+    monkeypatch.setattr(journal.Console, "progress", lambda console, steps, passed, rate, *_: rates.append(rate))
     results = play(tmp_path, steps=500), play(tmp_path, steps=800, resume=True)
     assert [given for given, _ in made] == [(5, 3, 1), (3, 2, 0)]
     clocks = [clock for _, clock in made]

@@ -31,6 +31,11 @@ class Entries:
     def seeds(self) -> np.ndarray:
         return self.axis[0]
 
+    @property
+    def end_with_one(self) -> bool:
+        """Return whether the run ends when one seed diverges, as in neither a sweep nor a population."""
+        return not self.config.points and self.config.plan.rule is None
+
     def point(self, k: int) -> Point:
         """Return the swept values of entry k."""
         config = self.config
@@ -58,12 +63,6 @@ class Watch:
     last: Callable[[], str]  # returns a clause on the run's last checkpoint
     say: Callable[[str], None]
 
-    @property
-    def ends_with_one(self) -> bool:
-        """Return whether the run ends when one seed diverges, as in neither a sweep nor a population."""
-        config = self.entries.config
-        return not config.points and config.plan.rule is None
-
     def after_chunk(self, metrics: dict[str, Any], first_step: int, diverged: np.ndarray) -> np.ndarray:
         """Return which entries (S,) have diverged before a chunk's end, given those before it.
 
@@ -71,7 +70,7 @@ class Watch:
             FloatingPointError: none is left, or none may be given up.
         """
         broken = np.any(metrics["bad_step"] >= 0, axis=1)
-        if self.ends_with_one or np.all(broken | diverged):
+        if self.entries.end_with_one or np.all(broken | diverged):
             require_finite(metrics["bad_step"], metrics["bad_reward"], first_step, self.last)
         return self._given_up(broken, diverged)
 
@@ -82,7 +81,7 @@ class Watch:
             FloatingPointError: none is left, or none may be given up. The checkpoint before must stay.
         """
         spoiled = ~finite_seeds(agents)
-        if self.ends_with_one or np.all(spoiled | diverged):
+        if self.entries.end_with_one or np.all(spoiled | diverged):
             require_finite_parameters(agents, iteration, self.last)
         return self._given_up(spoiled, diverged)
 

@@ -168,7 +168,7 @@ class _Run:
         seconds, wall = self.journal.records.earlier_seconds(iteration, *form)
         self.journal.records.keep_history(steps)
         diverged = np.zeros(len(seeds), bool)
-        if len(evaluations.steps) and not self.watch.ends_with_one:
+        if len(evaluations.steps) and not self.entries.end_with_one:
             diverged |= ~np.isfinite(evaluations.returns["train"][:, -1]).all(axis=(1, 2))
         now = _Progress(state, steps, seconds, wall, evaluations, diverged)
         if steps < plan.steps or len(evaluations.steps):
