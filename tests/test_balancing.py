@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from probes import QUICK, learner, random_batch, tasks_of
 
-from mtjax.agents.fit import above
+from mtjax.agents.fit import above_least
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients import surgery
 from mtjax.agents.parts.gradients.balancing import FAMO, Balance, GradNorm
@@ -199,7 +199,7 @@ def test_losses_are_counted_from_the_least_that_they_can_be(rule):
 
     def found(below):
         agent = Likelihood(below=below)
-        loss = lambda critic, scale: above(agent.least_loss, agent.critic_loss)({"critic": critic}, scale, None)
+        loss = lambda critic, scale: above_least(agent, agent.critic_loss)({"critic": critic}, scale, None)
         memory, gradients = surgery.init(rule, Params(jnp.float32(1), {}), 3), []
         for place, after in ((1.0, 0.5), (0.5, 0.4), (0.4, 0.1), (0.1, 0.1)):
             seen = surgery.gradient(rule, loss, Params(jnp.float32(place), {}), scales, memory, KEY)

@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import errno
 import io
+import itertools
 import json
 import os
 import pathlib
@@ -656,9 +657,8 @@ def test_spoiled_parameters_are_not_saved(play, tmp_path, monkeypatch):
     """Those of a chunk's last update, which none of its losses has seen."""
     lose = lambda net: jax.tree.map(lambda x: x.at[1].set(jnp.nan), net)
     spoil = lambda agent: with_nets(agent, actor=lose(agent.nets["actor"]))
-    check = entries.require_finite_parameters
-    late = lambda agent, step, last: check(spoil(agent) if step == 100 else agent, step, last)
-    monkeypatch.setattr(entries, "require_finite_parameters", late)
+    check, times = entries.finite_seeds, itertools.count(1)
+    monkeypatch.setattr(entries, "finite_seeds", lambda agent: check(spoil(agent) if next(times) == 2 else agent))
     with pytest.raises(FloatingPointError, match=r"before step 100 \(number 1 .*; the last checkpoint is '.*/50'"):
         play(tmp_path)
     assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"50"}

@@ -118,8 +118,9 @@ def descend(
     return state._replace(nets=state.nets | fitted.nets, fits=state.fits | {name: fitted.state}), fitted
 
 
-def above(least: float | Array, loss: Callable) -> Callable:
-    """Subtract its lower bound from a loss of one task, for rules of surgery that compare losses."""
+def above_least(agent: Any, loss: Callable) -> Callable:
+    """Subtract its lower bound from the critics' loss of one task, for rules of surgery that compare losses."""
+    least = agent.least_loss + agent.representation.least_loss
 
     def found(nets: Nets, *data: Any) -> tuple[Array, Any]:
         value, aux = loss(nets, *data)

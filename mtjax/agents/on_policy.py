@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import critics, parts, unit_resets
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.fit import Fit, Losses, above, descend
+from mtjax.agents.fit import Fit, Losses, above_least, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy
@@ -69,8 +69,7 @@ def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, ke
     def critic_loss(nets: Nets, batch: Batch, error: Array) -> tuple[Array, Metrics]:
         return agent.critic_loss(nets, batch)[0], {"td_error": error}
 
-    least = agent.least_loss + agent.representation.least_loss
-    critic = above(least, critic_loss), (with_models(agent, state, batch, key), error)
+    critic = above_least(agent, critic_loss), (with_models(agent, state, batch, key), error)
     actor = agent.actor_loss, (batch, jax.random.split(key, state.num_tasks))
     return Losses(state.nets, {"critic": critic, "actor": actor}, batch)
 
@@ -234,7 +233,7 @@ class OnPolicy(BaseAgent):
         data = (batch, jax.random.split(sample_key, len(tasks.id)))
         moved, actor = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance)
         state = self.accept(moved, state, actor.aux.kl)
-        loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
+        loss = above_least(self, self.critic_loss)
         batch = self.view.keyed(with_models(self, state, batch, key), jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         state = unit_resets.renew(self, state, batch, jax.random.fold_in(key, 5), number)

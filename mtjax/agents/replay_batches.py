@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from mtjax.agents.fit import Losses, above
+from mtjax.agents.fit import Losses, above_least
 from mtjax.agents.networks import Params
 from mtjax.agents.rates import discounts, discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
@@ -116,13 +116,13 @@ def critic_data(agent: Any, state: AgentState, batch: Batch, key: Key) -> tuple[
 def losses(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
     """Return the losses of critics and actor on windows (T, B, L, ...), without changing observations at random."""
     target_key, actor_key = jax.random.split(key)
-    batch, least = prepare(agent, state, window, tasks), agent.least_loss + agent.representation.least_loss
+    batch = prepare(agent, state, window, tasks)
 
     def critic_loss(nets: Nets, batch: Batch, target: Any) -> tuple[Array, Metrics]:
         loss, aux = agent.critic_loss(nets, batch, target)
         return loss, aux.metrics
 
-    critic = above(least, critic_loss), critic_data(agent, state, batch, target_key)
+    critic = above_least(agent, critic_loss), critic_data(agent, state, batch, target_key)
     actor = agent.actor_loss, (batch, jax.random.split(actor_key, state.num_tasks))
     return Losses(state.nets, {"critic": critic, "actor": actor}, batch)
 

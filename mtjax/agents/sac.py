@@ -10,7 +10,7 @@ import optax
 
 from mtjax.agents import combinations, replay_batches, unit_resets
 from mtjax.agents.base import BaseAgent, Inputs, Memory
-from mtjax.agents.fit import Fit, above, descend
+from mtjax.agents.fit import Fit, above_least, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.continual import Continual
@@ -166,7 +166,7 @@ class SAC(BaseAgent):
         importance = self.sampler.weights(state.nets["sampler"].own, batch.temperature)
 
         data = replay_batches.critic_data(self, state, batch, target_key)
-        loss = above(self.least_loss + self.representation.least_loss, self.critic_loss)
+        loss = above_least(self, self.critic_loss)
         state, fitted = descend(self.fits, "critic", state, loss, data, critic_order, importance)
         state = replay_batches.with_statistics(state, "critic", fitted.aux.statistics)
 

@@ -80,10 +80,10 @@ class Watch:
         Raises:
             FloatingPointError: none is left, or none may be given up. The checkpoint before must stay.
         """
-        spoiled = ~finite_seeds(agents)
-        if self.entries.end_with_one or np.all(spoiled | diverged):
-            require_finite_parameters(agents, iteration, self.last)
-        return self._given_up(spoiled, diverged)
+        finite = finite_seeds(agents)
+        if self.entries.end_with_one or np.all(~finite | diverged):
+            require_finite_parameters(finite, iteration, self.last)
+        return self._given_up(~finite, diverged)
 
     def _given_up(self, broken: np.ndarray, diverged: np.ndarray) -> np.ndarray:
         for k in np.flatnonzero(broken & ~diverged):

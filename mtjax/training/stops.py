@@ -62,16 +62,12 @@ def require_finite(bad_step: np.ndarray, bad_reward: np.ndarray, first_step: int
     )
 
 
-def require_finite_parameters(state: Any, iteration: int, last: Callable[[], str]) -> None:
-    """Check the parameters of an agent before they are saved, because a chunk's last update is in none of its losses.
-
-    Args:
-        state: the agent's, leaves (S, ...).
+def require_finite_parameters(finite: np.ndarray, iteration: int, last: Callable[[], str]) -> None:
+    """Check the result of ``finite_seeds`` before agents are saved, as a chunk's last update is in none of its losses.
 
     Raises:
-        FloatingPointError: networks hold numbers that are not finite.
+        FloatingPointError: an agent holds numbers that are not finite.
     """
-    finite = finite_seeds(state)
     if not np.all(finite):
         raise FloatingPointError(
             f"parameters stopped being finite in the update before step {iteration} (number {np.argmin(finite)} of the "
