@@ -23,6 +23,7 @@ from mtjax.agents.parts.remembering import Continual
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
+from mtjax.agents.parts.targets import Target
 from mtjax.agents.rates import discounts, discounts_of_all, scheduled
 from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.agents.view import View, init_inputs, join_arrays
@@ -110,6 +111,8 @@ class BaseAgent(abc.ABC):
     """Whether tasks share what knows them even where each has networks of its own."""
     least_loss: ClassVar[float] = 0.0
     """Lower bound of the critics' loss of a task, without what the representation adds."""
+    target: ClassVar[Target] = Target()
+    """What the critics are fitted to, in agents with a replay."""
     continual: ClassVar[Continual] = Continual()
     """How the actor remembers tasks that it learned one after another."""
     plasticity: ClassVar[Plasticity] = Plasticity()
@@ -225,9 +228,11 @@ class BaseAgent(abc.ABC):
 
     @property
     def unroll(self) -> int:
-        """Steps of the windows through which a memory learns, with burn-in, of a rollout all; 0 if none does."""
+        """Steps of the windows that memory or targets need, with burn-in, of a rollout all; 0 if single steps do."""
         way: Any = self.conditioning
-        return getattr(self.experience, "unroll", way.burn_in + way.recurrent_steps) if way.recurs else 0
+        if not way.recurs:
+            return self.target.window
+        return getattr(self.experience, "unroll", way.burn_in + way.recurrent_steps)
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state for the training ``tasks`` (T, ...)."""

@@ -81,7 +81,7 @@ def diagnose(policy: Policy, replay: Ring, batch_size: int) -> Diagnostics:
     if not isinstance(agent, SAC):
         raise InputError(f"diagnostics are of SAC and agents made from it, not of {type(agent).__name__}")
     if agent.unroll:
-        raise InputError("diagnostics look at single transitions, and this conditioning learns from windows")
+        raise InputError("diagnostics look at single transitions, and this agent learns from windows")
     found = []
     for s in range(len(policy.seeds)):
         state, rows = jax.tree.map(lambda x, s=s: x[s], (policy.states, replay.rows))
