@@ -140,7 +140,7 @@ def bonus(agent: Any, nets: Nets, batch: Batch, cost: Array, next_q: Array, q: C
     drawn = jnp.all(jnp.abs(agent.policy.action(kept.raw, mask) - batch.action) < _ROUNDING, axis=-1)
     log_ratio = jnp.where(drawn, agent.policy.log_prob(outputs, kept.raw, mask) - kept.log_prob, -jnp.inf)
     value, next_value = (reduce(agent.value.mean(x), agent.critic_reduction == "min") for x in (q(), next_q))
-    steps = Transition(None, None, batch.reward, batch.discount, None, cut=batch.cut)
+    steps = Transition(None, None, batch.reward, batch.discount, None, cut=batch.cut)  # type: ignore
     length = agent.unroll - agent.conditioning.burn_in
     windows = jax.tree.map(lambda x: x.reshape(-1, length).T, (steps, value, next_value + entropy, log_ratio))
     return entropy + agent.target.beyond(*windows).T.reshape(-1)
