@@ -95,8 +95,8 @@ class RunConfig:
     as mt10, are mixtures."""
     agent: str = "sac-conditioned"
     """Name of the agent. --list shows all names. Its parts are chosen by --agent.conditioning, --agent.representation,
-    --agent.encoder, --agent.gradients, --agent.value, --agent.scaling, --agent.sampler, --agent.continual and
-    --agent.plasticity, each by name. A part adds its own flags."""
+    --agent.encoder, --agent.gradients, --agent.value, --agent.target, --agent.scaling, --agent.sampler,
+    --agent.continual and --agent.plasticity, each by name. A part adds its own flags."""
     preset: Literal["auto", "cpu", "gpu"] = "auto"
     """Tuned defaults of the flags below for one kind of device. auto takes the device that JAX runs on."""
     runs: str = "runs"

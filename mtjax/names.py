@@ -21,6 +21,7 @@ CHOICES = (
     "encoder",
     "gradients",
     "value",
+    "target",
     "scaling",
     "sampler",
     "continual",

@@ -66,6 +66,13 @@ def test_joined_steps_lead_to_the_same_values(kind):
     assert_known_values(*learned("sac-conditioned", kind, n_step=3, policy_delay=2, update_every=2), kind)
 
 
+@pytest.mark.parametrize("kind", one_in(2, ["delayed", "endless"]))
+def test_retrace_leads_to_the_same_values(kind):
+    """From windows of three steps, with ends inside: a termination ends the bootstrap, a time limit the sum alone."""
+    given = {"target": "retrace", "retrace_steps": 3, "batch_size": 12}
+    assert_known_values(*learned("sac-conditioned", kind, **given), kind)
+
+
 def test_the_policy_finds_the_best_action_of_each_task():
     """The best action is the scale, whose sign the tasks differ in."""
     actions = mean_actions(*learned("sac-conditioned", "by-action"), [0.0])

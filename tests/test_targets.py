@@ -1,5 +1,7 @@
 """Targets against plain loops, and against each other where theory says that they are the same."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,18 +97,56 @@ def test_retrace_cuts_by_the_ratio_of_the_next_action():
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_vtrace_converges_to_the_value_of_the_clipped_policy():
-    """On the tabular process, whose chances are known (Espeholt et al. 2018, theorem 1): mu acts, pi is asked for."""
-    random, gamma, length, count = np.random.default_rng(0), 0.8, 12, 4000
+def test_retrace_with_lambda_0_is_td():
+    """To the bit."""
+    found = targets.retrace(STEPS, VALUE, NEXT_VALUE, LOG_RATIO, GAMMA, 0.0)
+    np.testing.assert_array_equal(found, targets.td(STEPS, NEXT_VALUE, GAMMA))
+
+
+def test_retrace_on_policy_is_the_lambda_return():
+    """By hand for gamma and lambda of a half: of 2 + 6 / 2 = 5, 4 + (10 + 5) / 2 / 2 and 8 + (20 + 7.75) / 2 / 2.
+
+    The value after a step is that of the next action, as where a policy always takes the same one.
+    """
+    one = lambda *x: jnp.float32(x)[:, None]
+    goes_on = jnp.zeros((3, 1), bool)
+    steps = Transition(None, None, one(8, 4, 2), one(1, 1, 1), None, goes_on, goes_on, goes_on)
+    found = targets.retrace(steps, one(99, 20, 10), one(20, 10, 6), one(0, 0, 0), 0.5, 0.5)
+    np.testing.assert_allclose(found[:, 0], [14.9375, 7.75, 5], rtol=1e-6)
+    value = np.concatenate([VALUE[:1], NEXT_VALUE[:-1]])
+    found = targets.retrace(STEPS, value, NEXT_VALUE, 0 * LOG_RATIO, GAMMA, LAMBDA)
+    expected = targets.lambda_returns(STEPS, NEXT_VALUE, GAMMA, LAMBDA)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+class Chain(NamedTuple):
+    """Steps (L, N) that a policy mu plays in the tabular process, whose chances are known."""
+
+    chances: np.ndarray  # (state, action, next state)
+    rewards: np.ndarray  # (state, action)
+    pi: np.ndarray  # (state, action) the policy that is asked for
+    mu: np.ndarray
+    state: np.ndarray
+    action: np.ndarray
+    following: np.ndarray
+
+    @property
+    def steps(self):
+        reward = jnp.float32(self.rewards[self.state, self.action])
+        return Transition(None, None, reward, jnp.ones_like(reward), None, *[self.state < 0] * 3)
+
+    @property
+    def log_ratio(self):
+        return jnp.float32(np.log(self.pi / self.mu)[self.state, self.action])
+
+
+@pytest.fixture(scope="module")
+def chain():
+    random, length, count = np.random.default_rng(0), 12, 4000
     tables = jax.tree.map(lambda x: np.asarray(x[0], float), make("tabular-mdp", num_tasks=1).tasks().goal)
-    chances, rewards = tables["transitions"], tables["rewards"]  # (state, action, next state), (state, action)
+    chances, rewards = tables["transitions"], tables["rewards"]
     num_states, num_actions = rewards.shape
     pi, mu = (random.dirichlet(np.ones(num_actions), size=num_states) for _ in range(2))
-    clipped = np.minimum(mu, pi)  # min(1, pi / mu) mu
-    clipped /= clipped.sum(axis=1, keepdims=True)
-    moves, gains = np.einsum("sa,sax->sx", clipped, chances), np.einsum("sa,sa->s", clipped, rewards)
-    exact = np.linalg.solve(np.eye(num_states) - gamma * moves, gains)
-
     draw = lambda shares: np.minimum(
         (random.random((count, 1)) > shares.cumsum(axis=-1)).sum(axis=-1), shares.shape[1] - 1
     )
@@ -116,14 +156,51 @@ def test_vtrace_converges_to_the_value_of_the_clipped_policy():
         then = draw(chances[now, action])
         played.append((now, action, then))
         now = then
-    state, action, following = (np.stack(x) for x in zip(*played, strict=True))
-    steps = Transition(
-        None, None, jnp.float32(rewards[state, action]), jnp.ones((length, count)), None, *[state < 0] * 3
-    )
-    log_ratio, value = jnp.float32(np.log(pi[state, action] / mu[state, action])), np.zeros(num_states)
-    vtrace = jax.jit(lambda now, then: targets.vtrace(steps, now, then, log_ratio, gamma, 1.0))
+    return Chain(chances, rewards, pi, mu, *(np.stack(x) for x in zip(*played, strict=True)))
+
+
+def values_of(policy, chain, gamma):
+    """The values (state,) of a policy, in closed form."""
+    moves, gains = np.einsum("sa,sax->sx", policy, chain.chances), np.einsum("sa,sa->s", policy, chain.rewards)
+    return np.linalg.solve(np.eye(len(gains)) - gamma * moves, gains)
+
+
+def test_vtrace_converges_to_the_value_of_the_clipped_policy(chain):
+    """Where mu acts and pi is asked for (Espeholt et al. 2018, theorem 1)."""
+    gamma, num_states = 0.8, len(chain.rewards)
+    clipped = np.minimum(chain.mu, chain.pi)  # min(1, pi / mu) mu
+    exact = values_of(clipped / clipped.sum(axis=1, keepdims=True), chain, gamma)
+    value = np.zeros(num_states)
+    vtrace = jax.jit(lambda now, then: targets.vtrace(chain.steps, now, then, chain.log_ratio, gamma, 1.0))
     for _ in range(400):
-        found = vtrace(*(jnp.float32(value[x]) for x in (state, following)))
-        error = np.asarray(found.target) - value[state]
-        value += [0.3 * error[state == s].mean() for s in range(num_states)]
+        found = vtrace(*(jnp.float32(value[x]) for x in (chain.state, chain.following)))
+        error = np.asarray(found.target) - value[chain.state]
+        value += [0.3 * error[chain.state == s].mean() for s in range(num_states)]
     np.testing.assert_allclose(value, exact, rtol=0.02)
+
+
+def test_retrace_converges_to_the_values_of_the_policy(chain):
+    """Where mu acts and pi is asked for (Munos et al. 2016, theorem 1). Returns of what mu plays do not."""
+    gamma, num_actions = 0.8, chain.rewards.shape[1]
+    exact = chain.rewards + gamma * chain.chances @ values_of(chain.pi, chain, gamma)
+    place = chain.state * num_actions + chain.action
+    times = np.bincount(place.ravel(), minlength=exact.size)
+
+    @jax.jit
+    def retrace(q, then):
+        return targets.retrace(chain.steps, q, then, chain.log_ratio, gamma, 1.0)
+
+    @jax.jit
+    def returns(q, then):
+        return targets.lambda_returns(chain.steps, then, gamma, 1.0)
+
+    def error_of(target):
+        """How far learned values are from exact ones, in shares of their mean, where mu plays."""
+        q = np.zeros(exact.shape)
+        for _ in range(50):
+            then = np.sum(chain.pi * q, axis=1)[chain.following]
+            error = np.asarray(target(jnp.float32(q.flat[place]), jnp.float32(then))) - q.flat[place]
+            q += (np.bincount(place.ravel(), error.ravel(), exact.size) / np.maximum(times, 1)).reshape(exact.shape)
+        return np.average(np.abs(q - exact).ravel(), weights=times) / np.mean(exact)
+
+    assert error_of(retrace) < 0.02 < 0.05 < error_of(returns)

@@ -24,6 +24,7 @@ from mtjax.agents.parts.policies import Gaussian, Policy
 from mtjax.agents.parts.representations import Representation
 from mtjax.agents.parts.samplers import Sampler
 from mtjax.agents.parts.scaling import Scaling
+from mtjax.agents.parts.targets import Target
 from mtjax.agents.parts.watching import Watcher
 from mtjax.agents.rates import discounts, discounts_of_all, scheduled
 from mtjax.agents.state import AgentState, Nets, of_task
@@ -112,6 +113,8 @@ class BaseAgent(abc.ABC):
     """Whether tasks share what knows them even where each has networks of its own."""
     least_loss: ClassVar[float] = 0.0
     """Lower bound of the critics' loss of a task, without what the representation adds."""
+    target: ClassVar[Target] = Target()
+    """What the critics are fitted to, in agents with a replay."""
     continual: ClassVar[Continual] = Continual()
     """How the actor remembers tasks that it learned one after another."""
     plasticity: ClassVar[Plasticity] = Plasticity()
@@ -232,10 +235,10 @@ class BaseAgent(abc.ABC):
 
     @property
     def unroll(self) -> int:
-        """Steps of the windows through which a memory learns, with burn-in, of a rollout all; 0 if none does."""
-        if not self.conditioning.recurs:
-            return 0
+        """Steps of the windows that memory or targets need, with burn-in, of a rollout all; 0 if single steps do."""
         way: Any = self.conditioning
+        if not way.recurs:
+            return self.target.window
         return way.burn_in + way.recurrent_steps if self.experience.storage.kept else self.experience.steps
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:

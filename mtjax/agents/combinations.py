@@ -159,14 +159,15 @@ def check_replayed(agent: Any) -> None:
     if agent.representation.predicts and replay.n_step > 1:
         name = _name(agent, "representation")
         raise InputError(f"{name} learns models of single steps; use n-step=1, not {replay.n_step}")
-    if agent.conditioning.recurs and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
-        name = _name(agent, "conditioning")
-        raise InputError(f"conditioning={name} needs n-step=1, hindsight=0 and host-replay-size=0")
+    recurs, burn_in = agent.conditioning.recurs, agent.conditioning.burn_in
+    if agent.unroll and (replay.n_step > 1 or replay.hindsight or replay.host_replay_size):
+        kind = "conditioning" if recurs else "target"
+        raise InputError(f"{kind}={_name(agent, kind)} needs n-step=1, hindsight=0 and host-replay-size=0")
     if agent.unroll > replay.warmup_steps + 1:
-        burn_in = agent.conditioning.burn_in
+        steps = f"{'recurrent' if recurs else 'retrace'}-steps={agent.unroll - burn_in}"
         front = f" after burn-in={burn_in}" if burn_in else ""
         raise InputError(
-            f"recurrent-steps={agent.unroll - burn_in}{front} needs as many steps before the first update: "
+            f"{steps}{front} needs as many steps before the first update: "
             f"warmup-steps of at least {agent.unroll - 1}, not {replay.warmup_steps}"
         )
 
@@ -227,6 +228,8 @@ def require_sight(agent: Any, spec: Spec) -> None:
         )
     if frames.shown(spec.obs) and agent.view.history:
         raise InputError("tasks cannot be inferred from pictures; choose another conditioning")
+    if frames.shown(spec.obs) and agent.target.window:
+        raise InputError(f"target={_name(agent, 'target')} sums over windows of vectors, not pictures; use target=td")
     if frames.shown(spec.obs) and agent.conditioning.recurs:
         name = _name(agent, "conditioning")
         raise InputError(f"conditioning={name} reads vectors, not pictures; choose another conditioning")

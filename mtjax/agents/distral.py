@@ -92,7 +92,7 @@ class Distral(SAC):
         """Choose an action (A,) by the task's own policy, or by the distilled one for a task that is not known."""
         inputs = self.view.acting(state, memory, obs, task)
         outputs = jnp.where(task.id < state.num_tasks, self.policy_outputs(*inputs), self.distilled(*inputs))
-        return Acted(self.policy.draw(outputs, task.action_mask, key).action, outputs=outputs)
+        return self.acted(outputs, task, key)
 
     def sample(self, nets: Nets, batch: Batch, obs: Any, key: Key) -> Sample:
         outputs = self.policy_outputs(nets, batch.features, obs)

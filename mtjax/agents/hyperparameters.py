@@ -16,6 +16,7 @@ from mtjax.agents.parts.policies import policy_for
 from mtjax.agents.parts.representations import REPRESENTATIONS
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
+from mtjax.agents.parts.targets import TARGETS
 from mtjax.agents.parts.values import VALUES
 from mtjax.checks import OF_TRAIN, checked
 from mtjax.experience import EXPERIENCES
@@ -30,6 +31,7 @@ PARTS: dict[str, Mapping[str, type]] = {
     "encoder": ENCODERS,
     "gradients": surgery.RULES,
     "value": VALUES,
+    "target": TARGETS,
     "scaling": SCALINGS,
     "sampler": SAMPLERS,
     "continual": CONTINUAL,

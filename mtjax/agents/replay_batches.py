@@ -1,5 +1,6 @@
 """Batches of a replay, for agents that learn from one: what the losses of soft actor-critic take and find."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -8,11 +9,16 @@ import optax
 
 from mtjax.agents.fit import Losses, above_least
 from mtjax.agents.networks import Params
+from mtjax.agents.parts.targets import Behaviour
+from mtjax.agents.parts.values import reduce
 from mtjax.agents.rates import discounts, discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import pictures
 from mtjax.experience.replay import joined
 from mtjax.types import Array, Key, Metrics, Task, Transition
+
+_ROUNDING = 1e-3
+"""Actions that differ by more are not those that the policy has drawn."""
 
 
 class Batch(NamedTuple):
@@ -28,6 +34,8 @@ class Batch(NamedTuple):
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     model_targets: Any = None  # targets of the representation's models
     followed: Array | None = None  # (B,) bool: next_obs is what followed; None: it always is
+    behaviour: Behaviour | None = None  # of the policy that acted, if targets ask for it
+    cut: Array | None = None  # (B,) bool: sums of rewards end with the step, if targets sum over windows
 
 
 class Sample(NamedTuple):
@@ -62,7 +70,9 @@ def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key:
     """
     batch, inputs, view = transitions(agent, window, tasks), state.nets["inputs"], agent.view
     batch = batch if key is None else agent.representation.augment(batch, key)
-    past, next_past = view.around(inputs, window, batch, batch if batch.extras is None else batch.extras)
+    kept = batch.extras if isinstance(batch.extras, Behaviour) else None
+    last = batch.extras if isinstance(batch.extras, Transition) else batch
+    past, next_past = view.around(inputs, window, batch, last)
     temperature = jnp.exp(state.nets["temperature"].parts["log"])
     bonus = temperature * abs(agent.target_entropy) * action_sizes(batch.action, tasks.action_mask) / 2
     gamma = discounts(agent, tasks)
@@ -76,6 +86,8 @@ def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key:
         temperature=jnp.broadcast_to(temperature, len(tasks.id)),
         mask=tasks.action_mask,
         followed=pictures.followed(batch),
+        behaviour=kept,
+        cut=None if kept is None else batch.cut,
     )
 
 
@@ -86,7 +98,8 @@ def transitions(agent: Any, window: Transition, tasks: Task) -> Transition:
     """
     if agent.unroll:
         learned = lambda x: x[:, :, agent.conditioning.burn_in :].reshape(len(x), -1, *x.shape[3:])
-        return jax.tree.map(learned, window._replace(memory=None))
+        memory = None if agent.conditioning.recurs else window.memory
+        return jax.tree.map(learned, window._replace(memory=memory))
     return joined(window, discounts_of_all(agent, tasks), agent.experience.n_step)
 
 
@@ -111,6 +124,27 @@ def critic_data(agent: Any, state: AgentState, batch: Batch, key: Key) -> tuple[
     model_targets, keys = agent.representation.targets(representation, followed, batch.next_obs, key)
     target = jax.vmap(agent.critic_target, (axes_of(state.nets), axes_of(slow), 0, 0))
     return batch._replace(model_targets=model_targets), target(state.nets, slow, batch, keys)
+
+
+def bonus(agent: Any, nets: Nets, batch: Batch, cost: Array, next_q: Array, q: Callable[[], Array]) -> Array:
+    """Return what adds to the next values (B,) of a batch: their entropy, and what later steps of windows add.
+
+    Args:
+        cost: (B,) what the temperature weighs of the actions that the policy has sampled there.
+        next_q: (N, B, outputs) of the target critics for these actions.
+        q: a function that returns theirs for the actions that were taken.
+    """
+    entropy, kept = -batch.temperature * cost, batch.behaviour
+    if kept is None:
+        return entropy
+    outputs, mask = agent.policy_outputs(nets, batch.features, batch.obs), batch.mask
+    drawn = jnp.all(jnp.abs(agent.policy.action(kept.raw, mask) - batch.action) < _ROUNDING, axis=-1)
+    log_ratio = jnp.where(drawn, agent.policy.log_prob(outputs, kept.raw, mask) - kept.log_prob, -jnp.inf)
+    value, next_value = (reduce(agent.value.mean(x), agent.critic_reduction == "min") for x in (q(), next_q))
+    steps = Transition(None, None, batch.reward, batch.discount, None, cut=batch.cut)  # type: ignore
+    length = agent.unroll - agent.conditioning.burn_in
+    windows = jax.tree.map(lambda x: x.reshape(-1, length).T, (steps, value, next_value + entropy, log_ratio))
+    return entropy + agent.target.beyond(*windows).T.reshape(-1)
 
 
 def losses(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:

@@ -15,6 +15,7 @@ from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.plasticity import Plasticity
+from mtjax.agents.parts.targets import Target
 from mtjax.agents.parts.values import Value, reduce
 from mtjax.agents.rates import scheduled
 from mtjax.agents.replay_batches import ActorAux, Batch, CriticAux, Sample
@@ -63,6 +64,7 @@ class SAC(BaseAgent):
     unit_head: bool = False
     """Keep the weights of each output of actor and critics at length 1."""
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=Value)
+    target: Annotated[Target, FLAT] = dataclasses.field(default_factory=Target)
     continual: Annotated[Continual, FLAT] = dataclasses.field(default_factory=Continual)
     plasticity: Annotated[Plasticity, FLAT] = dataclasses.field(default_factory=Plasticity)
     experience: Annotated[Replay, FLAT] = dataclasses.field(default_factory=Replay)
@@ -96,8 +98,12 @@ class SAC(BaseAgent):
 
     def act(self, state: AgentState, memory: Memory, obs: Any, task: Task, key: Key | None) -> Acted:
         """Choose an action (A,) for one observation (O,) of one task; without a key, the mean action."""
-        outputs = self.policy_outputs(*self.view.acting(state, memory, obs, task))
-        return Acted(self.policy.draw(outputs, task.action_mask, key).action, outputs=outputs)
+        return self.acted(self.policy_outputs(*self.view.acting(state, memory, obs, task)), task, key)
+
+    def acted(self, outputs: Array, task: Task, key: Key | None) -> Acted:
+        """Draw an action (A,) from the policy's outputs, and keep of it what targets ask for."""
+        drawn = self.policy.draw(outputs, task.action_mask, key)
+        return Acted(drawn.action, self.target.keep(drawn), outputs)
 
     # Losses of one task.
 
@@ -128,7 +134,9 @@ class SAC(BaseAgent):
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Any:
         """Compute the critic target y (B, ...), in the form that ``value.loss`` takes."""
         action, _, cost = self.sample(nets, batch, batch.next_obs, key)
-        next_q, bonus = self.q(slow, batch.features, batch.next_obs, action), -batch.temperature * cost
+        next_q = self.q(slow, batch.features, batch.next_obs, action)
+        q = lambda: self.q(slow, batch.features, batch.obs, batch.action)
+        bonus = replay_batches.bonus(self, nets, batch, cost, next_q, q)
         return self.value.target(next_q, self.critic_reduction == "min", batch.reward, batch.discount, bonus)
 
     def critic_loss(self, nets: Nets, batch: Batch, target: Any) -> tuple[Array, CriticAux]:

@@ -82,8 +82,8 @@ class XQC(SAC):
 
     def critic_target(self, nets: Nets, slow: Nets, batch: Batch, key: Key) -> Aim:
         action, _, cost = self.sample(nets, batch, batch.next_obs, key)
-        _, next_q, _ = self.q_of_both(slow, batch, action)
-        low, bonus = self.critic_reduction == "min", -batch.temperature * cost
+        q, next_q, _ = self.q_of_both(slow, batch, action)
+        low, bonus = self.critic_reduction == "min", replay_batches.bonus(self, nets, batch, cost, next_q, lambda: q)
         return Aim(self.value.target(next_q, low, batch.reward, batch.discount, bonus), action)
 
     def critic_loss(self, nets: Nets, batch: Batch, target: Aim) -> tuple[Array, CriticAux]:

@@ -83,8 +83,8 @@ def _require_one_replay(settings: Settings, agent: Any) -> None:
     blind = not agent.conditioning.tells and agent.heads == "shared"
     if not blind or agent.representation.embeds or agent.unroll or agent.experience.n_step > 1:
         raise InputError(
-            "--keep-replay mixes single steps of all tasks: use --agent.conditioning=none, --agent.heads=shared and "
-            "--n-step=1"
+            "--keep-replay mixes single steps of all tasks: use --agent.conditioning=none, --agent.heads=shared, "
+            "--n-step=1 and --agent.target=td"
         )
 
 

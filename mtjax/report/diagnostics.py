@@ -82,8 +82,8 @@ def with_experience(policy: Policy, directory: str | Path, point: int = 0) -> tu
         raise InputError("diagnostics are of agents whose networks take vectors")
     if agent.losses is None:
         raise InputError(f"diagnostics are of agents with losses of single steps, and those of {name} are not")
-    if agent.conditioning.recurs:
-        raise InputError("diagnostics look at single transitions, and this conditioning learns from windows")
+    if agent.unroll:
+        raise InputError("diagnostics look at single transitions, and this agent learns from windows")
     if agent.experience.storage.kept:
         return policy, *load_experience(directory, point)
     settings, tasks = from_json(Path(directory) / "config.json").training, policy.env.tasks("train")

@@ -127,10 +127,11 @@ def _introduction(config: RunConfig, hooks: Hooks) -> list[str]:
 
 
 def _sizes(config: RunConfig) -> str:
-    """Return a line on how many worlds and transitions of a batch a task has, and all tasks together."""
+    """Return a line on how many worlds, and transitions or windows of a batch, a task has, and all tasks together."""
     count, experience = config.played_tasks, config.learner.experience
+    drawn = "windows" if config.learner.unroll else "transitions"
     sizes = {"worlds": config.training.num_envs}
-    sizes |= {"transitions in a batch": experience.batch_size} if experience.storage.kept else {}
+    sizes |= {f"{drawn} in a batch": experience.batch_size} if experience.storage.kept else {}
     told = lambda size: f"{size:,}" if count == 1 else f"{size:,} a task, {count * size:,} in all"
     return "; ".join(f"{name}: {told(size)}" for name, size in sizes.items())
 

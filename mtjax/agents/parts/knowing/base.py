@@ -23,6 +23,7 @@ class Nothing:
     by_parameters: ClassVar[bool] = False  # whether these are the task's parameters
     embeds: ClassVar[bool] = False  # whether every training task has a learned vector, called embedding
     recurs: ClassVar[bool] = False  # whether features are a memory that learns, through the steps of a window
+    burn_in: ClassVar[int] = 0  # first steps of a window that only renew that memory
     by_actor: ClassVar[bool] = True  # whether the actor's loss trains it too, in agents that learn from rollouts
     draws: ClassVar[bool] = False  # whether its own loss needs a key
 
