@@ -219,7 +219,7 @@ def _picture(name: str) -> str:
     text = ""
     for file in PICTURES.glob(f"{name}.*"):
         filmed = [row for runs in _FILMED for row in _runs_of(runs, name)]
-        last = filmed[-1:] if file.suffix == ".gif" else []
+        last = filmed[-1:] if file.suffix == ".webp" else []
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
         text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for r in last)
     return text
