@@ -35,7 +35,7 @@ from mtjax.report import figures
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = Path(__file__).parent / "pictures" / "families"
-PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
+LATE = Path(__file__).parent / "late_search.js"
 ADDRESSES = Path(__file__).parent / "addresses.toml"
 _CLONE = "git clone <this repository>"
 _LOG = logging.getLogger("mkdocs.plugins.mtjax")
@@ -74,7 +74,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the made pages, and the plots that pages on results show."""
+    """Add the made pages and the curves that they show."""
     try:
         pages = {f"families/{name}.md": family_page(name) for name in envs.ENVS}
     except InputError as error:  # Meta-World's scenes are another package's
@@ -84,22 +84,24 @@ def on_files(files: Files, config: Any) -> Files:
     for place, text in pages.items():
         files.append(File.generated(config, place, content=text))
     files.append(File.generated(config, "llms.txt", content=llms(config, files)))
-    for plot in RESULTS.rglob("*.png"):
-        place = plot.relative_to(RESULTS).as_posix()
-        files.append(File.generated(config, f"results/plots/{place}", abs_src_path=str(plot)))
     for place, curves in _curves().items():
         files.append(File.generated(config, f"{place}.png", content=_drawn(curves)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Turn links to plots in the repository into links to their copies on the site, and name the owner's addresses."""
+    """Name the owner's addresses where they belong."""
     known = addresses()
     if known["repository"]:
         markdown = markdown.replace(_CLONE, f"git clone {known['repository']}")
     if known["doi"] and page.file.src_uri == "citing.md":
         markdown += f"\nDOI: <{known['doi']}>\n"
-    return markdown.replace(f"]({PICTURE}", "](plots/")
+    return markdown
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """Let the page read the search's index when it is wanted."""
+    return output.replace("</head>", f"<script>{LATE.read_text(encoding='utf-8')}</script></head>", 1)
 
 
 @lru_cache
@@ -132,7 +134,7 @@ def _pages(entries: Iterable[Any]) -> Iterator[str]:
 
 def _entry(root: str, file: Any) -> str:
     """Return a page's line: title, address and first sentence."""
-    text = file.content_string
+    text = re.sub(r"(?s)\A---.*?\n---\n", "", file.content_string)  # what a page tells the builder
     title = re.search(r"^# (.+)$", text, re.M)
     plain = re.sub(r"(?m)^[#|!<].*$", "", re.sub(r"(?s)```.*?```", "", text))
     linked = lambda link: link[1] or ""
