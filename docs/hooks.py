@@ -15,7 +15,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from itertools import pairwise, takewhile
+from itertools import groupby, pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -419,7 +419,7 @@ def _rows(file: Path, column: int, value: str) -> str:
 
 
 def to_markdown(docstring: str | None) -> str:
-    """Return a docstring as Markdown: labels in bold, indented lists as lists, equations as code."""
+    """Return a docstring as Markdown: labels in bold, indented lists as lists, equations set apart."""
     return "\n\n".join(_block(*block) for block in _blocks(inspect.cleandoc(docstring or "").splitlines()))
 
 
@@ -444,9 +444,16 @@ def _block(text: str, below: list[str]) -> str:
         items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in _items(below)]
         return f"**{text}**\n\n" + "\n".join(f"- {item}" for item in items)
     if below and not re.match(_LABEL, text) and (text.endswith(":") or re.search(r" (=|<-) ", below[0])):
-        return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
-    whole = " ".join([text, *(line.strip() for line in below)])
-    return re.sub(_LABEL, r"**\1**: ", whole)
+        return f"{text}\n\n{_code(below)}"
+    told = []
+    for deeper, group in groupby([text, *below], lambda line: line.startswith("    ")):
+        lines = [line.strip() for line in group]
+        told.append(_code(lines) if deeper else " ".join(lines))
+    return re.sub(_LABEL, r"**\1**: ", "\n\n".join(told))
+
+
+def _code(lines: Iterable[str]) -> str:
+    return "\n".join(["```text", *lines, "```"])
 
 
 def _items(lines: list[str]) -> list[str]:
