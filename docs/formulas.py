@@ -107,8 +107,10 @@ class _Reader:
             self.at += 1
             if mark == "_":
                 below = self.script()
+            elif mark == "^":
+                above = self.script()
             else:
-                above += self.script() if mark == "^" else f"<mo>{len(mark) * _PRIME}</mo>"
+                base = f'<mrow>{base}<mo lspace="0" rspace="0">{len(mark) * _PRIME}</mo></mrow>'
         return _hung(base, below, above, under=token in _BELOW)
 
     def script(self) -> str:
@@ -161,8 +163,8 @@ def _sign(sign: str) -> str:
 
 def _hung(base: str, below: str, above: str, under: bool = False) -> str:
     if below and above:
-        return f"<msubsup>{base}{below}<mrow>{above}</mrow></msubsup>"
+        return f"<msubsup>{base}{below}{above}</msubsup>"
     if below:
         tag = "munder" if under else "msub"
         return f"<{tag}>{base}{below}</{tag}>"
-    return f"<msup>{base}<mrow>{above}</mrow></msup>" if above else base
+    return f"<msup>{base}{above}</msup>" if above else base

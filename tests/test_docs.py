@@ -127,7 +127,7 @@ def test_formula_inside_a_labelled_text(hooks):
 def seen(formula):
     """The elements and texts of a formula, without the brackets of its markup."""
     made = made_of("formulas").to_mathml(formula)
-    return re.sub(r"</?(mrow|mstyle|math)[^>]*>| stretchy=.false.", "", made)
+    return re.sub(r"</?(mrow|mstyle|math)[^>]*>| (stretchy|[lr]space)=\"[a-z0]+\"", "", made)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def seen(formula):
     [
         ("x_(t+1)", "<msub><mi>x</mi><mi>t</mi><mo>+</mo><mn>1</mn></msub>"),
         ("L_pi_i", "<msub><mi>L</mi><msub><mi>π</mi><mi>i</mi></msub></msub>"),
-        ("s'_t^2", "<msubsup><mi>s</mi><mi>t</mi><mo>\N{PRIME}</mo><mn>2</mn></msubsup>"),
+        ("s'_t^2", "<msubsup><mi>s</mi><mo>\N{PRIME}</mo><mi>t</mi><mn>2</mn></msubsup>"),
         ("Qbar", "<mover><mi>Q</mi><mo>¯</mo></mover>"),
         ("sum_k w", '<munder><mo>∑</mo><mi>k</mi></munder><mspace width="0.25em"/><mi>w</mi>'),
         ("sqrt(x) <- 2 y", '<msqrt><mi>x</mi></msqrt><mo>←</mo><mn>2</mn><mspace width="0.25em"/><mi>y</mi>'),
