@@ -157,6 +157,16 @@ def test_sentences_in_a_block_are_not_set():
 
 
 @needs("mkdocs")
+def test_pages_of_families_have_one_shape(hooks):
+    """What is observed and done, the reward, the start and the end stand in each, behind a label."""
+    for name, (cls, _) in ENVS.items():
+        if cls.__module__.startswith("mtjax"):  # and not another test's own
+            page = "\n\n".join(hooks.to_markdown(each.__doc__) for each in (cls, *hooks._described_bases(cls)))
+            lacks = [x for x in ("Observation", "Action", "Reward", "Start", "Episode") if f"**{x}" not in page]
+            assert not lacks, (name, lacks)
+
+
+@needs("mkdocs")
 def test_pages_of_families_name_their_reward(hooks):
     """A family that changes another one shows that one's text too, up to the reward and the observation."""
     for name in ("walker-run", "cartpole-swingup", "hopper-hop-backward"):
