@@ -104,6 +104,11 @@ def on_post_page(output: str, **_: Any) -> str:
     return output.replace("</head>", f"<script>{LATE.read_text(encoding='utf-8')}</script></head>", 1)
 
 
+def on_post_template(output_content: str, **_: Any) -> str:
+    """Do so on the page that stands for those that are missing."""
+    return on_post_page(output_content)
+
+
 @lru_cache
 def addresses() -> dict[str, str]:
     """Return the addresses that only the owner of a published copy knows, by name; empty where there is none."""

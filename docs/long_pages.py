@@ -13,6 +13,7 @@ from mkdocs.structure.files import File, Files
 FOLDER = "results/"
 MOST = 6.0  # screens of a page
 _ROW, _LETTER, _PICTURE, _TEXT = 0.05, 0.00032, 0.7, 0.037  # screens of 1440 x 900, fitted to pages in a browser
+_LONG = 200  # letters of a text's line, links and all
 _HOMES: dict[str, dict[str, str]] = {}  # of a page that was cut: anchor -> the page that has it now
 
 
@@ -68,7 +69,7 @@ def screens(text: str) -> float:
 def _height(line: str) -> float:
     if line.startswith("|"):
         return _ROW + _LETTER * len(line)
-    return _PICTURE if line.startswith("![") else _TEXT
+    return _PICTURE if line.startswith("![") else _TEXT * max(len(line) / _LONG, 1)
 
 
 def cut(text: str) -> list[str]:
