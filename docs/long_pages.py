@@ -13,6 +13,7 @@ from mkdocs.structure.files import File, Files
 FOLDER = "results/"
 MOST = 6.0  # screens of a page
 _ROW, _LETTER, _PICTURE, _TEXT = 0.05, 0.00032, 0.7, 0.037  # screens of 1440 x 900, fitted to pages in a browser
+_LIST = 1  # screen of what the first page says of the others
 _LONG = 200  # letters of a text's line, links and all
 _HOMES: dict[str, dict[str, str]] = {}  # of a page that was cut: anchor -> the page that has it now
 
@@ -73,11 +74,14 @@ def _height(line: str) -> float:
 
 
 def cut(text: str) -> list[str]:
-    """Cut a page at its titles into parts of at most ``MOST`` screens, or of one title."""
+    """Cut a page at its titles into parts of at most ``MOST`` screens, or of one title. The first lists the others."""
+    if screens(text) <= MOST:
+        return [text]
     pieces = re.split(r"(?m)^(?=###? )", text)
     parts = pieces[:1]
     for piece in pieces[1:]:
-        if screens(parts[-1] + piece) > MOST and anchors(parts[-1]):
+        most = MOST - _LIST * (len(parts) == 1)
+        if screens(parts[-1] + piece) > most and anchors(parts[-1]):
             parts.append(piece)
         else:
             parts[-1] += piece
