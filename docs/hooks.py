@@ -15,7 +15,7 @@ import textwrap
 import tomllib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from itertools import pairwise, takewhile
+from itertools import groupby, pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from mtjax.report import figures
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = Path(__file__).parent / "pictures" / "families"
-PICTURE = "../../benchmarks/results/"  # as pages name it, so that it is found on the site and in the repository
+LATE = Path(__file__).parent / "late_search.js"
 ADDRESSES = Path(__file__).parent / "addresses.toml"
 _CLONE = "git clone <this repository>"
 _LOG = logging.getLogger("mkdocs.plugins.mtjax")
@@ -74,7 +74,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the made pages, and the plots that pages on results show."""
+    """Add the made pages and the curves that they show."""
     try:
         pages = {f"families/{name}.md": family_page(name) for name in envs.ENVS}
     except InputError as error:  # Meta-World's scenes are another package's
@@ -84,22 +84,29 @@ def on_files(files: Files, config: Any) -> Files:
     for place, text in pages.items():
         files.append(File.generated(config, place, content=text))
     files.append(File.generated(config, "llms.txt", content=llms(config, files)))
-    for plot in RESULTS.rglob("*.png"):
-        place = plot.relative_to(RESULTS).as_posix()
-        files.append(File.generated(config, f"results/plots/{place}", abs_src_path=str(plot)))
     for place, curves in _curves().items():
         files.append(File.generated(config, f"{place}.png", content=_drawn(curves)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Turn links to plots in the repository into links to their copies on the site, and name the owner's addresses."""
+    """Name the owner's addresses where they belong."""
     known = addresses()
     if known["repository"]:
         markdown = markdown.replace(_CLONE, f"git clone {known['repository']}")
     if known["doi"] and page.file.src_uri == "citing.md":
         markdown += f"\nDOI: <{known['doi']}>\n"
-    return markdown.replace(f"]({PICTURE}", "](plots/")
+    return markdown
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """Let the page read the search's index when it is wanted."""
+    return output.replace("</head>", f"<script>{LATE.read_text(encoding='utf-8')}</script></head>", 1)
+
+
+def on_post_template(output_content: str, **_: Any) -> str:
+    """Do so on the page that stands for those that are missing."""
+    return on_post_page(output_content)
 
 
 @lru_cache
@@ -132,7 +139,7 @@ def _pages(entries: Iterable[Any]) -> Iterator[str]:
 
 def _entry(root: str, file: Any) -> str:
     """Return a page's line: title, address and first sentence."""
-    text = file.content_string
+    text = re.sub(r"(?s)\A---.*?\n---\n", "", file.content_string)  # what a page tells the builder
     title = re.search(r"^# (.+)$", text, re.M)
     plain = re.sub(r"(?m)^[#|!<].*$", "", re.sub(r"(?s)```.*?```", "", text))
     linked = lambda link: link[1] or ""
@@ -219,7 +226,7 @@ def _picture(name: str) -> str:
     text = ""
     for file in PICTURES.glob(f"{name}.*"):
         filmed = [row for runs in _FILMED for row in _runs_of(runs, name)]
-        last = filmed[-1:] if file.suffix == ".gif" else []
+        last = filmed[-1:] if file.suffix == ".webp" else []
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
         text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for r in last)
     return text
@@ -417,7 +424,7 @@ def _rows(file: Path, column: int, value: str) -> str:
 
 
 def to_markdown(docstring: str | None) -> str:
-    """Return a docstring as Markdown: labels in bold, indented lists as lists, equations as code."""
+    """Return a docstring as Markdown: labels in bold, indented lists as lists, equations set apart."""
     return "\n\n".join(_block(*block) for block in _blocks(inspect.cleandoc(docstring or "").splitlines()))
 
 
@@ -442,9 +449,16 @@ def _block(text: str, below: list[str]) -> str:
         items = [re.sub(r"^([\w, -]+?):", r"**\1**:", line) for line in _items(below)]
         return f"**{text}**\n\n" + "\n".join(f"- {item}" for item in items)
     if below and not re.match(_LABEL, text) and (text.endswith(":") or re.search(r" (=|<-) ", below[0])):
-        return f"{text}\n\n```text\n{chr(10).join(below)}\n```"
-    whole = " ".join([text, *(line.strip() for line in below)])
-    return re.sub(_LABEL, r"**\1**: ", whole)
+        return f"{text}\n\n{_code(below)}"
+    told = []
+    for deeper, group in groupby([text, *below], lambda line: line.startswith("    ")):
+        lines = [line.strip() for line in group]
+        told.append(_code(lines) if deeper else " ".join(lines))
+    return re.sub(_LABEL, r"**\1**: ", "\n\n".join(told))
+
+
+def _code(lines: Iterable[str]) -> str:
+    return "\n".join(["```text", *lines, "```"])
 
 
 def _items(lines: list[str]) -> list[str]:

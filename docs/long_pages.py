@@ -12,7 +12,9 @@ from mkdocs.structure.files import File, Files
 
 FOLDER = "results/"
 MOST = 6.0  # screens of a page
-_TABLE, _PICTURE, _TEXT = 0.042, 0.3, 0.027  # screens of a line
+_ROW, _LETTER, _PICTURE, _TEXT = 0.05, 0.00032, 0.7, 0.037  # screens of 1440 x 900, fitted to pages in a browser
+_LIST = 1  # screen of what the first page says of the others
+_LONG = 200  # letters of a text's line, links and all
 _HOMES: dict[str, dict[str, str]] = {}  # of a page that was cut: anchor -> the page that has it now
 
 
@@ -62,16 +64,24 @@ def _resolved(path: PurePosixPath) -> PurePosixPath:
 
 def screens(text: str) -> float:
     """Return roughly how many screens a text takes."""
-    height = lambda line: _TABLE if line.startswith("|") else _PICTURE if line.startswith("![") else _TEXT
-    return sum(map(height, text.splitlines()))
+    return sum(map(_height, filter(None, text.splitlines())))
+
+
+def _height(line: str) -> float:
+    if line.startswith("|"):
+        return _ROW + _LETTER * len(line)
+    return _PICTURE if line.startswith("![") else _TEXT * max(len(line) / _LONG, 1)
 
 
 def cut(text: str) -> list[str]:
-    """Cut a page at its titles into parts of at most ``MOST`` screens, or of one title."""
+    """Cut a page at its titles into parts of at most ``MOST`` screens, or of one title. The first lists the others."""
+    if screens(text) <= MOST:
+        return [text]
     pieces = re.split(r"(?m)^(?=###? )", text)
     parts = pieces[:1]
     for piece in pieces[1:]:
-        if screens(parts[-1] + piece) > MOST and anchors(parts[-1]):
+        most = MOST - _LIST * (len(parts) == 1)
+        if screens(parts[-1] + piece) > most and anchors(parts[-1]):
             parts.append(piece)
         else:
             parts[-1] += piece

@@ -31,6 +31,7 @@ FOLDER = Path(__file__).parent / "pictures" / "families"
 SIZE = (160, 120)
 SKIPPED = 150  # steps of a long episode before a film of it, in which the body gets going
 FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the next, milliseconds that each is shown
+QUALITY = 70  # a third of the bytes that a gif has
 
 
 def draw(name: str) -> None:
@@ -39,7 +40,7 @@ def draw(name: str) -> None:
     if Path(name).is_dir() or trained:
         for family, frames in play(mtjax.load(trained[0] if trained else name)):
             save(name_of(family), frames)
-    elif name.startswith("metaworld-") or (FOLDER / f"{name}.gif").exists():
+    elif name.startswith("metaworld-") or (FOLDER / f"{name}.webp").exists():
         return
     elif isinstance(mtjax.make(name), Pictured):
         save(name, [start(name)])
@@ -49,8 +50,11 @@ def save(name: str, frames: list[Image.Image]) -> None:
     """Write a film, or a still if it is one frame, in place of what was there."""
     for old in FOLDER.glob(f"{name}.*"):
         old.unlink()
+    if len(frames) == 1:
+        frames[0].quantize(64).save(FOLDER / f"{name}.png", optimize=True)
+        return
     rest = {"append_images": frames[1:], "save_all": True, "duration": DURATION, "loop": 0}
-    frames[0].save(FOLDER / f"{name}.{'gif' if frames[1:] else 'png'}", optimize=True, **(rest if frames[1:] else {}))
+    frames[0].save(FOLDER / f"{name}.webp", quality=QUALITY, method=6, **rest)
 
 
 def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
@@ -66,7 +70,7 @@ def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
         moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
         if np.mean(moves) < 0.5:  # a goal that is reached already
             film = frames_from(family, rows, states, 0)
-        yield family, [Image.fromarray(frame).quantize(64) for frame in film]
+        yield family, [Image.fromarray(frame) for frame in film]
 
 
 def frames_from(family: Any, rows: Sequence[int], states: Any, first: int) -> np.ndarray:
@@ -81,7 +85,7 @@ def start(name: str) -> Image.Image:
     tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
     states = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), len(tasks.row))).state
     stills = [render.film(env, int(row), each(states, slice(i, i + 1)), *SIZE)[0] for i, row in enumerate(tasks.row)]
-    return Image.fromarray(np.concatenate(stills, axis=1)).quantize(64)
+    return Image.fromarray(np.concatenate(stills, axis=1))
 
 
 def few(count: int) -> np.ndarray:

@@ -118,6 +118,55 @@ def test_equation_below_a_sentence_is_code(hooks):
 
 
 @needs("mkdocs")
+def test_formula_inside_a_labelled_text(hooks):
+    """It stands apart, and the text goes on below it."""
+    made = hooks.to_markdown("Runs.\n\nReward: with the speed v,\n        r = v / 10\n    at all times.")
+    assert made == "Runs.\n\n**Reward**: with the speed v,\n\n```text\nr = v / 10\n```\n\nat all times."
+
+
+def seen(formula):
+    """The elements and texts of a formula, without the brackets of its markup."""
+    made = made_of("formulas").to_mathml(formula)
+    return re.sub(r"</?(mrow|mstyle|math)[^>]*>| (stretchy|[lr]space)=\"[a-z0]+\"", "", made)
+
+
+@pytest.mark.parametrize(
+    ("formula", "made"),
+    [
+        ("x_(t+1)", "<msub><mi>x</mi><mi>t</mi><mo>+</mo><mn>1</mn></msub>"),
+        ("L_pi_i", "<msub><mi>L</mi><msub><mi>π</mi><mi>i</mi></msub></msub>"),
+        ("s'_t^2", "<msubsup><mi>s</mi><mo>\N{PRIME}</mo><mi>t</mi><mn>2</mn></msubsup>"),
+        ("Qbar", "<mover><mi>Q</mi><mo>¯</mo></mover>"),
+        ("sum_k w", '<munder><mo>∑</mo><mi>k</mi></munder><mspace width="0.25em"/><mi>w</mi>'),
+        ("sqrt(x) <- 2 y", '<msqrt><mi>x</mi></msqrt><mo>←</mo><mn>2</mn><mspace width="0.25em"/><mi>y</mi>'),
+        ("<a, b>", "<mo>⟨</mo><mi>a</mi><mo>,</mo><mi>b</mi><mo>⟩</mo>"),
+        ("a < b", "<mi>a</mi><mo>&lt;</mo><mi>b</mi>"),
+    ],
+)
+@needs("mkdocs")
+def test_formulas_are_set(formula, made):
+    assert seen(formula) == made
+
+
+@needs("mkdocs")
+def test_sentences_in_a_block_are_not_set():
+    set_apart = made_of("formulas").on_page_markdown
+    prose = "```text\nw = 1, the one expert that one gives for a task\n```"
+    assert set_apart(prose) == prose
+    assert "<math" in set_apart("```text\nL = (V(s) - y)^2 / 2   (loss of the critic)\n```")
+
+
+@needs("mkdocs")
+def test_pages_of_families_have_one_shape(hooks):
+    """What is observed and done, the reward, the start and the end stand in each, behind a label."""
+    for name, (cls, _) in ENVS.items():
+        if cls.__module__.startswith("mtjax"):  # and not another test's own
+            page = "\n\n".join(hooks.to_markdown(each.__doc__) for each in (cls, *hooks._described_bases(cls)))
+            lacks = [x for x in ("Observation", "Action", "Reward", "Start", "Episode") if f"**{x}" not in page]
+            assert not lacks, (name, lacks)
+
+
+@needs("mkdocs")
 def test_pages_of_families_name_their_reward(hooks):
     """A family that changes another one shows that one's text too, up to the reward and the observation."""
     for name in ("walker-run", "cartpole-swingup", "hopper-hop-backward"):
@@ -126,9 +175,11 @@ def test_pages_of_families_name_their_reward(hooks):
 
 
 def weight(page):
-    """The bytes of a page with its pictures, without what all pages share."""
-    shown = {page.parent / place for place in re.findall(r'<img[^>]*src="([^":]+)"', page.read_text())}
-    return page.stat().st_size + sum(picture.stat().st_size for picture in shown)
+    """The bytes of a page with its pictures, styles and scripts."""
+    text = page.read_text()
+    found = re.findall(r'<(?:img|script)[^>]*src="([^":]+)"|<link rel="stylesheet" href="([^":]+)"', text)
+    shown = {page.parent / (one or other).split("?")[0] for one, other in found}
+    return page.stat().st_size + sum(file.stat().st_size for file in shown)
 
 
 RESULTS = [page for page in DOCS if page.parent.name == "results"]
@@ -168,6 +219,20 @@ def test_addresses_stand_in_one_file(hooks, monkeypatch):
     assert read.startswith("git clone https://host/me/mtjax && cd mtjax") and "DOI: <https://doi.org/1>" in read
     monkeypatch.setattr(hooks, "addresses", lambda: dict.fromkeys(known, ""))
     assert hooks.on_page_markdown("git clone <this repository>", page) == "git clone <this repository>"
+
+
+@needs("mkdocs")
+def test_raw_files_are_linked_where_a_page_names_them():
+    """A file to its copy; a folder or a pattern to the list, whose titles have such anchors."""
+    raw, anchors = made_of("raw_files"), made_of("long_pages").anchors
+    read = lambda place, text: raw.on_page_markdown(text, SimpleNamespace(file=SimpleNamespace(src_uri=place)))
+    name = "`benchmarks/results/h200-families.csv`"
+    assert read("results/returns.md", name) == f"[{name}](raw/h200-families.csv)"
+    assert read("guide/pixels.md", name) == f"[{name}](../results/raw/h200-families.csv)"
+    for folder, anchor in (("h200-returns/", "h200-returns"), ("cpu-scaling-*.png", "single-files")):
+        assert raw.place(folder) == f"index.md#{anchor}" and anchor in anchors(raw.listing())
+    assert read("results/speed.md", "![a](../../benchmarks/results/a.png)") == "![a](raw/a.png)"
+    assert not raw.copy_of("h200-returns/table.md").endswith(".md")
 
 
 @pytest.mark.slow

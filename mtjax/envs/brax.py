@@ -64,9 +64,12 @@ _MJX_KEPT = ("x", "qpos", "qvel", "qacc_warmstart")
 class Brax(Family):
     """Brax: an environment of Brax as it is.
 
-    Observation (O,), action (A,) in [-1, 1], reward, start and termination are Brax's own (brax.envs), observation and
-        reward after the step. Termination, such as a fall of the ant, ends an episode for good; at 1000 steps, Brax's
-        episode length, it is cut off.
+    Observation (O,), after the step: Brax's own (brax.envs).
+    Action (A,): in [-1, 1], Brax's own.
+    Reward: Brax's own, after the step.
+    Start: Brax's own, drawn anew for every episode.
+    Episode: Brax's own termination, such as a fall of the ant, ends an episode for good; at 1000 steps, Brax's episode
+        length, it is cut off.
 
     Parameters that can vary, while all others stay as Brax has them:
         mass: scale of the masses and inertias of all links; joints' armature stays.

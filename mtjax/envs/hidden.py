@@ -70,6 +70,7 @@ class HiddenBandit(HiddenTasks):
     Observation (1,): always 0.
     Action: the number of the arm that is pulled; with ``scores`` a score for each (num_arms,).
     Reward: 1 with the arm's probability, else 0.
+    Start: there is one state.
     Episode: one pull; a trial of H pulls is ``--trials=H``.
 
     A task is the probabilities (num_arms,) of its arms, uniform in [0, 1]. Trials draw from ``num_draws`` tasks, which

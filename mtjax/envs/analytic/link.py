@@ -48,7 +48,8 @@ class Link(Pictured, Family):
         (q - q before) / (c T); the logarithm of latency over its least, log(1 + q / (c T)); that of packets sent over
         packets delivered, log(r T / delivered). Then log(r / 200), of the sender's own rate.
     Action (1,): how to change the rate, see a above.
-    Reward: delivered / (c T) - q / (c T) - dropped.
+    Reward: what arrives, less what waits and what is lost,
+            r = delivered / (c T) - q / (c T) - dropped
     Start: an empty queue, a rate uniform in [0.3, 1.5] c, and reports as of a step that uses the whole link.
     Episode: 400 steps; nothing terminates it. Metrics ``used``, ``queueing`` (q / (c T)) and ``dropped`` are those of
         the last step.

@@ -60,7 +60,9 @@ class Sailing(Pictured, Family):
         turning [rad/s]; apparent wind ahead and to the left [10 m/s]; speed over ground ahead and to the left [5 m/s];
         the sheet from -1 to 1.
     Action (2,): rudder d = a_0 pi / 4; sheet e_max = (1 + a_1) pi / 4.
-    Reward: metres by which a step has come nearer to the mark, over 10; minus 0.05; and 10 at the mark.
+    Reward: with the distances D before and D' after the step from the mark,
+            r = (D - D') / 10 - 0.05
+        and 10 more at the mark.
     Start: 100 m from the mark, facing anywhere, at 1 m/s through the water.
     Episode: 400 steps; it terminates within 5 m of the mark. Metric ``success`` is 1 there.
 

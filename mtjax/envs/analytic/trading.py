@@ -51,8 +51,9 @@ class Trading(Pictured, Family):
     Observation (3,): share that is left, and share of the time, both from 1 to 0; the change of the price since the
         start, over sigma sqrt(T).
     Action (1,): the pace a. 0 sells evenly over the rest of the time, 1 thirty times as fast.
-    Reward: the change of cash + x S, less lambda sigma^2 tau x^2 of the x after the trade; in basis points of the first
-        value of the shares, 50 million dollars.
+    Reward: with the change D of cash + x S, and the x after the trade,
+            r = D - lambda sigma^2 tau x^2
+        in basis points of the first value of the shares, 50 million dollars.
     Start: one million shares at 50 dollars.
     Episode: at most 50 steps; it terminates when all is sold.
 

@@ -35,9 +35,10 @@ class CartpoleBalance(Domain):
     Observation (5,), all after the step: position of the cart [m]; cosine and sine of the pole's angle from upright;
         velocities of cart [m/s] and pole [rad/s].
     Action (1,): force on the cart in [-1, 1]; a gear of 10 N.
-    Reward: the product of four terms: (1 + cosine) / 2; (4 + q) / 5, where q falls quadratically from 1 without force
-        to 0 at full force; (1 + g) / 2, where g is a Gaussian of the pole's velocity, 0.1 at 5 rad/s; and the same of
-        the cart's position, 0.1 at 2 m. If ``sparse``, 1 while the cart is within 0.25 m of the middle and the cosine
+    Reward: with the pole's angle theta and velocity omega, and the cart's position x,
+            r = (1 + cos theta) / 2 * (4 + q) / 5 * (1 + g_omega) / 2 * (1 + g_x) / 2
+        where q falls quadratically from 1 without force to 0 at full force, and g_omega and g_x are Gaussians, 0.1 at 5
+        rad/s and at 2 m. If ``sparse``, 1 while the cart is within 0.25 m of the middle and the cosine
         is at least 0.995, else 0. Returns lie in [0, 1000].
     Start: cart uniform in [-0.1, 0.1] m, pole in [-0.034, 0.034] rad, both velocities normal with deviation 0.01.
     Episode: 1000 steps of 0.01 s (one Runge-Kutta step of fourth order); it never terminates.

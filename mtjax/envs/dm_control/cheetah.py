@@ -83,7 +83,9 @@ class CheetahRun(Domain):
         angles of back thigh, shin and foot and of front thigh, shin and foot [rad]; then the torso's velocity along x
         [m/s] and the velocities of all the former in their order [m/s or rad/s].
     Action (6,): motor commands of the six joints in that order in [-1, 1]; gears of 120, 90, 60, 90, 60 and 30 N m.
-    Reward: the forward velocity of the centre of mass over 10 m/s, in [0, 1]; returns lie in [0, 1000].
+    Reward: the forward velocity v of the centre of mass over 10 m/s,
+            r = clip(v / 10, 0, 1)
+        Returns lie in [0, 1000].
     Start: the six joints uniform in their range, then 200 steps without control in which the body falls and settles;
         where and as fast as that leaves it, from a pool of such states drawn when the family is made.
     Episode: 1000 steps of 0.01 s (one substep); it never terminates.

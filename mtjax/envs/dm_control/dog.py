@@ -96,7 +96,9 @@ class Dog(Domain):
     Action (38,): motor commands in [-1, 1] of the back (extend, bend, twist), neck and tail (extend, bend), of the left
         and the right hind leg, of head and jaw, and of the left and the right foreleg, in the model's order; they act
         with a lag of 0.05 s.
-    Reward: stand * (4 * move + 1) / 5. stand is the product of six factors in [0, 1]. Two are 1 where torso and pelvis
+    Reward: in [0, 1],
+            r = stand (4 move + 1) / 5
+        where stand is the product of six factors in [0, 1]. Two are 1 where torso and pelvis
         are at 0.9 of the height of the model's own pose or above, and fall as Gaussians to 0.1 on the ground; three are
         1 where head, torso and pelvis are upright to 30 degrees, and fall linearly to 0 upside down; one is 1 where the
         paws bear the whole weight or more, and falls linearly to 0.9 where they bear none. move is 1 where the velocity

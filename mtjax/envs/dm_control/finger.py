@@ -82,7 +82,9 @@ class FingerSpin(Domain):
         relative to its hinge [m]; velocities of proximal, distal and hinge [rad/s]; log(1 + force) of the touch sensors
         at the top and the bottom of the fingertip [log N].
     Action (2,): motor commands of the proximal and distal joint in [-1, 1]; gears of 30 and 15 N m.
-    Reward: 1 while the hinge turns at -15 rad/s or faster, else 0; returns lie in [0, 1000].
+    Reward: with the hinge's velocity omega,
+            r = 1 if omega <= -15, else 0
+        Returns lie in [0, 1000].
     Start: both finger joints uniform in their range, the hinge uniform in [-pi, pi], at rest, drawn again until nothing
         touches.
     Episode: 1000 steps of 0.02 s (two substeps of 0.01 s); it never terminates.
@@ -135,7 +137,9 @@ class FingerTurn(Domain):
         at the top and the bottom of the fingertip [log N]; x and z of the target relative to the hinge [m]; the
         distance from the tip to the target's surface, negative inside [m].
     Action (2,): motor commands of the proximal and distal joint in [-1, 1]; gears of 30 and 15 N m.
-    Reward: 1 while the tip is inside the target, else 0; returns lie in [0, 1000].
+    Reward: with the distance d from the tip to the target's edge, negative inside,
+            r = 1 if d <= 0, else 0
+        Returns lie in [0, 1000].
     Start: both finger joints uniform in their range, hinge and target at angles uniform in [-pi, pi], at rest, drawn
         again until nothing touches.
     Episode: 1000 steps of 0.02 s (two substeps of 0.01 s); it never terminates.

@@ -40,8 +40,9 @@ class FishUpright(Domain):
         [m/s] and about its own [rad/s], and of the seven joints in their order [rad/s].
     Action (5,): angles in [-1, 1] rad that servos pull to: of the tail, of its twist, of both fins' flap, and of the
         left and the right fin's pitch.
-    Reward: a Gaussian of the distance of uprightness from 1, which is 0.1 at 0 (a fish on its side); returns lie in
-        [0, 1000].
+    Reward: with the uprightness u, which is 1 upright and 0 for a fish on its side,
+            r = 0.1^((1 - u)^2)
+        Returns lie in [0, 1000].
     Start: every joint uniform in [-0.2, 0.2] rad, the fish turned anyhow, at rest 0.1 m over the ground.
     Episode: 1000 steps of 0.04 s (ten substeps of 0.004 s); it never terminates.
 
@@ -97,7 +98,9 @@ class FishSwim(FishUpright):
     Observation (24,): FishUpright's, with x, y and z of the target as seen from the mouth, in the mouth's frame [m],
         between uprightness and velocities.
     Action (5,): as FishUpright.
-    Reward: (7 * near + upright) / 8 in [0, 1], where near is 1 with the mouth inside the target and falls as a Gaussian
+    Reward: in [0, 1],
+            r = (7 near + upright) / 8
+        where near is 1 with the mouth inside the target and falls as a Gaussian
         to 0.1 at a distance of twice the sum of their radii, and upright goes from 0 (back down) to 1.
     Start: as FishUpright, with the target uniform within 0.4 m along x and y, and 0.1 to 0.3 m over the ground.
     Episode: as FishUpright.

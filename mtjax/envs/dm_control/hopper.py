@@ -33,8 +33,9 @@ class Hopper(Domain):
         angles of waist, hip, knee and ankle [rad]; velocities of the torso along x and z [m/s] and about y, and of the
         four joints [rad/s]; log(1 + force) of the touch sensors at toe and heel [log N].
     Action (4,): motor commands of waist, hip, knee and ankle in [-1, 1]; gears of 30, 40, 30 and 10 N m.
-    Reward: 0 unless the torso's centre of mass is between 0.6 and 2 m above the foot's, and there 1 where the forward
-        velocity of the centre of mass is ``speed`` or more, falling linearly to 0 at rest; returns lie in [0, 1000].
+    Reward: with the forward velocity v of the centre of mass, and the height h of the torso's above the foot's,
+            r = clip(v / speed, 0, 1) if 0.6 <= h <= 2, else 0
+        Returns lie in [0, 1000].
     Start: the torso at its height of 1 m and at rest, with its pitch uniform in [-pi, pi] and all joints uniform in
         their range; limbs may begin inside the floor.
     Episode: 1000 steps of 0.02 s (four substeps of 0.005 s); it never terminates.

@@ -38,7 +38,9 @@ class Humanoid(Domain):
         along the world's axes [m/s] and about its own [rad/s], and of the joints in their order [rad/s].
     Action (21,): motor commands in [-1, 1] of abdomen (y, z, x), right hip (x, z, y), knee and ankle (x, y), the same
         of the left leg, right shoulder (1, 2) and elbow, and the same of the left arm; gears from 20 to 120 N m.
-    Reward: standing * upright * (4 + thrift) / 5 * (5 * move + 1) / 6 in [0, 1]. standing is 1 with the head at 1.4 m
+    Reward: in [0, 1],
+            r = standing upright (4 + thrift) / 5 * (5 move + 1) / 6
+        where standing is 1 with the head at 1.4 m
         or more and falls as a Gaussian to 0.1 at 1.05 m; upright is 1 where the torso's uprightness is 0.9 or more and
         falls linearly to 0 head down; thrift is 1 less the mean square of the action; move is 1 where the horizontal
         velocity of the centre of mass, in any direction, is ``speed`` or more, and falls linearly to 0 at rest. Returns

@@ -33,7 +33,9 @@ class PendulumSwingup(Domain):
 
     Observation (3,), all after the step: cosine and sine of the pole's angle from upright; its velocity [rad/s].
     Action (1,): torque in [-1, 1]; a gear of 1 N m, a fifth of what holds the pole level.
-    Reward: 1 while the pole is within 8 degrees of upright, else 0; returns lie in [0, 1000].
+    Reward: with the angle theta from upright, in degrees,
+            r = 1 if |theta| <= 8, else 0
+        Returns lie in [0, 1000].
     Start: the pole uniform in [-pi, pi], at rest.
     Episode: 1000 steps of 0.02 s; it never terminates.
 

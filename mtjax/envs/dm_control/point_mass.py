@@ -34,8 +34,9 @@ class PointMass(Domain):
     Observation (4,), all after the step: position of the ball, x and y [m]; its velocity [m/s]. The goal is not seen:
         it is what the task is.
     Action (2,): forces along x and y in [-1, 1]; gears of 0.1 N, which is a terminal velocity of 0.1 m/s.
-    Reward: the product of two terms: 1 within 0.015 m of the goal, falling as a Gaussian to 0.1 at 0.03 m; and
-        (4 + q) / 5, where q is the mean over both forces of what falls quadratically from 1 without force to 0 at full
+    Reward: with the distance d from the goal,
+            r = 0.1^((x / 0.015)^2) (4 + q) / 5,  x = max(d - 0.015, 0)
+        where q is the mean over both forces of what falls quadratically from 1 without force to 0 at full
         force. Returns lie in [0, 1000].
     Start: uniform in the arena, whose sides are 0.58 m, at rest.
     Episode: 1000 steps of 0.02 s; it never terminates.
@@ -98,8 +99,9 @@ class PointMassNavigate(PointMass):
     The two-dimensional navigation of Finn et al. 2017 ("Model-agnostic meta-learning"), whose reward is the negative
     squared distance from the goal; dm_control's own vanishes a few radii away, so that a goal must be found by chance.
 
-    Reward: 1 within 0.015 m of the goal, falling linearly to 0 at 0.41 m from that, half the arena's diagonal; returns
-        lie in [0, 100].
+    Reward: with the distance d from the goal,
+            r = max(1 - x / 0.41, 0),  x = max(d - 0.015, 0)
+        where 0.41 m is half the arena's diagonal. Returns lie in [0, 100].
     Start: in the middle, at rest.
     Episode: 100 steps of 0.1 s (five substeps of 0.02 s); a corner of the arena is some 32 steps away.
     """

@@ -39,7 +39,9 @@ class QuadrupedWalk(Domain):
         of torques [N m] at the four toes, x, y and z each.
     Action (12,): of the four legs in that order, what servos pull yaw, lift and extension to. [-1, 1] spans [-1, 1]
         rad, [-1, 1.1] rad and [-0.8, 0.8] rad; the servos follow with a lag of 0.1 s.
-    Reward: upright * move in [0, 1]: upright goes from 0 (back down) to 1, move is 1 where the torso's velocity along
+    Reward: in [0, 1],
+            r = upright move
+        where upright goes from 0 (back down) to 1, move is 1 where the torso's velocity along
         its own x axis is ``speed`` or more, falling linearly to 0.5 at rest and 0 at ``speed`` backwards. Returns lie
         in [0, 1000].
     Start: legs straight in the model's pose, the body turned anyhow, at rest, in the lowest of the heights 0, 0.01,

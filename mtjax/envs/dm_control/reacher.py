@@ -32,7 +32,9 @@ class Reacher(Domain):
     Observation (6,), all after the step: angles of shoulder and wrist [rad]; from the finger to the target, x and y
         [m]; velocities of shoulder and wrist [rad/s].
     Action (2,): torques of shoulder and wrist in [-1, 1]; gears of 0.05 N m.
-    Reward: 1 while the finger (0.01 m) touches the target, else 0; returns lie in [0, 1000].
+    Reward: with the distance d of the finger's centre from that of the target, and the target's radius R,
+            r = 1 if d <= R + 0.01, else 0
+        Returns lie in [0, 1000].
     Start: shoulder uniform in [-pi, pi], wrist in its range of 160 degrees to both sides, at rest; the target in any
         direction, uniformly 0.05 to 0.2 m from the shoulder.
     Episode: 1000 steps of 0.02 s; it never terminates.

@@ -49,8 +49,9 @@ class Swimmer(Domain):
         as seen from the nose, in the head's frame [m]; then of every link its velocity along its own x and y [m/s] and
         about z [rad/s].
     Action (links - 1,): torques of the joints from the head on in [-1, 1]; gears of 0.0005 N m.
-    Reward: 1 where the nose is within the target's radius, falling as 1 / (1 + (3 d / m)^2) with the distance d from
-        its edge, to 0.1 at m, five radii; returns lie in [0, 1000].
+    Reward: with the distance d from the nose to the target's edge, 0 inside, and m, five of its radii,
+            r = 1 / (1 + (3 d / m)^2)
+        Returns lie in [0, 1000].
     Start: every joint uniform in its range of 360 degrees over the number of links to both sides, the body turned
         anyhow about its head, at rest; the target uniform in a square of 2 m to both sides of the head, or of 0.3 m in
         a fifth of the episodes.

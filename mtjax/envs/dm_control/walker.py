@@ -37,7 +37,9 @@ class Walker(Domain):
         of right hip, knee and ankle, and left hip, knee and ankle [rad/s].
     Action (6,): motor commands of right hip, knee and ankle, and left hip, knee and ankle in [-1, 1]; gears of 100, 50
         and 20 N m.
-    Reward: stand * (5 * move + 1) / 6 in [0, 1]. stand is (3 * height + upright) / 4, where height is 1 with the torso
+    Reward: in [0, 1],
+            r = stand (5 move + 1) / 6,  stand = (3 height + upright) / 4
+        where height is 1 with the torso
         at 1.2 m or more and falls as a Gaussian to 0.1 at 0.6 m, and upright goes from 0 (head down) to 1. move is 1
         where the forward velocity of the centre of mass is ``speed`` or more, and falls linearly to 0 at rest. Returns
         lie in [0, 1000].

@@ -53,7 +53,7 @@ class Sawyer(Domain):
     Observation (39,): the hand (3) [m], how far the gripper is open (1, from 0 to 1), the task's things (14: position
         [m] and orientation of each, then zeros), all of these once more as of the step before, and the goal (3) [m];
         clipped to Meta-World's ranges.
-    Action (4,) in [-1, 1]: the way of the hand's target in x, y and z, of 0.01 m at most, inside the task's box; and
+    Action (4,): in [-1, 1], the way of the hand's target in x, y and z, of 0.01 m at most, inside the task's box; and
         the force that closes the gripper.
     Reward: Meta-World's second version, from 0 to 10.
     Metrics: success (0 or 1) after the step.

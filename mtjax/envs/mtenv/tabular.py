@@ -162,6 +162,7 @@ class Bandit(DrawnTasks):
     Observation (1,): always 0.
     Action: one of ``num_arms`` numbers, from 0: the arm that is pulled.
     Reward: 1 with the probability that the task gives to this arm, else 0.
+    Start: there is one state.
     Episode: 100 pulls; it never terminates.
 
     A task is one table: ``rewards`` (num_arms,) holds the probabilities of a reward, uniform in [0, 1]. The context is
