@@ -43,7 +43,8 @@ class Plan:
     """How long a run lasts, over which seeds, and when it is evaluated."""
 
     steps: int = 1_000_000
-    """Environment steps of each seed, summed over tasks. They are rounded up to whole chunks, all of one length."""
+    """Environment steps of each seed, summed over tasks. They are rounded up to whole steps of all worlds,
+    or whole rollouts of them, in chunks of one length."""
     seed: int = 0
     """The first seed."""
     seeds: int = 1
@@ -198,9 +199,9 @@ class RunConfig:
 
     @property
     def longest(self) -> int:
-        """Return the iterations of a chunk, were the run of many steps."""
-        many = self.training.num_envs * self.training.chunk_steps
-        return fit_chunk(self.training, 1, many, self.learner.experience.steps).chunk_steps
+        """Return the most iterations that a chunk has, however many steps the run takes."""
+        grain = self.learner.experience.steps
+        return math.ceil(self.training.chunk_steps / grain) * grain
 
     @cached_property
     def mesh(self) -> Mesh | None:
@@ -324,13 +325,21 @@ def for_tasks(preset: Mapping[str, Any], count: int, device: str) -> dict[str, A
 
 
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
-    """Return settings whose chunks divide the run evenly, each a multiple of ``grain`` steps."""
-    whole_run = math.ceil(steps / (num_tasks * settings.num_envs))
-    longest = math.ceil(min(settings.chunk_steps, whole_run) / grain) * grain
-    chunk = math.ceil(whole_run / math.ceil(whole_run / longest) / grain) * grain
-    if settings.plays.steps:  # tasks change between chunks
-        chunk = next((n for n in range(chunk, grain, -grain) if settings.plays.steps % n == 0), grain)
-    return dataclasses.replace(settings, chunk_steps=chunk)
+    """Return settings whose chunks, each a multiple of ``grain`` steps, make a run hardly longer than ``steps``.
+
+    One program plays all chunks, so that they have one length: the longest of those that leave the last chunk fullest.
+    There may be 50 chunks, or four times as many as are needed. So a run takes ``steps``, rounded up to ``grain`` steps
+    of all its worlds, and at most 2% more.
+    """
+    units = math.ceil(steps / (num_tasks * settings.num_envs * grain))
+    least = math.ceil(units / math.ceil(settings.chunk_steps / grain))
+    counts = range(least, min(max(4 * least, 50), least + 100) + 1)
+    lengths = {math.ceil(units / count) for count in counts}
+    chunk = min(lengths, key=lambda length: (-units % length, -length))
+    if every := settings.plays.steps:  # tasks change between chunks
+        longest = max(lengths)
+        chunk = next((length for length in range(longest, 1, -1) if every % (length * grain) == 0), 1)
+    return dataclasses.replace(settings, chunk_steps=chunk * grain)
 
 
 def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:

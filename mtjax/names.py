@@ -8,7 +8,7 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
@@ -79,11 +79,14 @@ def replacing(path: Path) -> Iterator[Path]:
         new.unlink(missing_ok=True)
 
 
-def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
+def nearest_error(kind: str, given: str, allowed: Iterable[str], own: str = "") -> InputError:
     """Return an error for an unknown name, with the nearest match and the allowed names.
 
     Of more than 20 allowed names the message lists only similar ones: those written alike, whatever the capitals, or
     else those that end with what was given.
+
+    Args:
+        own: what to say of the user's own classes, as ``describe_unnamed`` does.
     """
     allowed = list(allowed)
     plain = {_plain(name): name for name in allowed}
@@ -92,7 +95,26 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str]) -> InputError:
     hint = f"did you mean {near[0]!r}? " if near else ""
     few = len(allowed) <= _MANY
     shown = ", ".join(allowed if few else near or allowed[:6]) + ("" if few else f", ... ({len(allowed)} in all)")
-    return InputError(f"unknown {kind} {given!r}; {hint}choose from: {shown}")
+    return InputError(f"unknown {kind} {given!r}; {hint}choose from: {shown}{own}")
+
+
+def describe_unnamed(base: str, given: str, named: Collection[Any]) -> str:
+    """Return how to name the user's own classes that nothing has registered; an empty string if there are none.
+
+    Args:
+        base: "module:Class", from which they derive.
+        given: the name that was asked for.
+        named: the classes that have names, and places of others.
+    """
+    if base.partition(":")[0] not in sys.modules:
+        return ""
+    classes: list[type] = [load(base)]
+    for cls in classes:
+        classes += cls.__subclasses__()
+    own = [c for c in classes if not (c.__module__.startswith("mtjax.") or c.__subclasses__() or c in named)]
+    alike = lambda cls: difflib.SequenceMatcher(None, _plain(cls.__name__), _plain(given)).ratio()
+    name = max(own, key=alike).__name__ if own else ""
+    return f"; your {name} has no name: call mtjax.register({given!r}, {name})" if own else ""
 
 
 def _plain(name: Any) -> str:

@@ -358,6 +358,9 @@ def test_a_policy_takes_one_task(result):
         policy(np.zeros(9), one, size=1.0)
     with pytest.raises(InputError, match=r"has shape \(9,\), not \(4, 3, 9\); a batch has one axis before it"):
         policy(np.zeros((4, 3, 9)), one)
+    for impossible in (-1.0, [1.0, -1.0, 1.1]):
+        with pytest.raises(InputError, match="size must be greater than 0, not -1"):
+            policy(np.zeros((3, 9)), size=impossible)
     many = policy(np.ones((3, 9)), one)
     np.testing.assert_allclose(many, np.tile(policy(np.ones(9), one), (3, 1)), rtol=1e-6)
     assert jax.vmap(policy, (0, None))(np.zeros((3, 9)), one).shape == (3, 2)

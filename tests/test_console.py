@@ -1,9 +1,11 @@
 """Progress of a run on the terminal: what lines and bars say, and the time that is left."""
 
 import io
+import re
 
 import numpy as np
 import pytest
+import rich
 
 from mtjax.training import console as consoles
 from mtjax.training.console import Clock, Console
@@ -123,16 +125,23 @@ def test_quiet_console_is_quiet(capsys):
     assert capsys.readouterr() == ("", "")
 
 
+class Terminal(io.StringIO):
+    """A terminal of some columns, in place of the standard output."""
+
+    def __init__(self, monkeypatch, columns):
+        super().__init__()
+        monkeypatch.setattr("sys.stdout", self)
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", str(columns))
+        rich.reconfigure()  # it has one console, which reads COLUMNS once
+
+    def isatty(self):
+        return True
+
+
 def test_console_draws_a_bar_on_a_terminal(monkeypatch):
     """Lines still come out whole, and closing leaves the terminal as it was."""
-
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    monkeypatch.setattr("sys.stdout", terminal := Terminal())
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "160")
+    terminal = Terminal(monkeypatch, 160)
     console = Console(2000)
     console.say("a [line] with brackets")
     console.doing("evaluating")
@@ -143,3 +152,22 @@ def test_console_draws_a_bar_on_a_terminal(monkeypatch):
     assert "a [line] with brackets\n" in text and "2,000 of 2,000  " in text and "━" in text
     assert "evaluated train 7" in text
     assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1
+
+
+def test_a_narrow_terminal_cuts_off_what_matters_least(monkeypatch):
+    """Of 80 columns are left the returns and the time; where all fits, steps, rate and evaluations follow."""
+    told = ["return 850 (worst task 700, best 1000)", "31 min 40 s left", "4,000,000 of 100,000,000", "32,700 steps/s"]
+    clock = Clock(96, 0)
+    clock.chunk(20.0)
+
+    def last_line(columns):
+        terminal = Terminal(monkeypatch, columns)
+        console = Console(100_000_000, clock=clock)
+        console.evaluation(3_000_000, {"train": np.full((1, 2, 1), 840.0)})
+        console.progress(4_000_000, 80.0, 32_700.0, np.array([[700.0, 1000.0]]))
+        console.close()
+        return re.split("[\r\n]", re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal.getvalue()).rstrip())[-1]
+
+    assert last_line(200).lstrip("━╸ ") == "  ".join([*told, "evaluated train 840"])
+    line = last_line(80)
+    assert len(line) <= 80 and all(text in line for text in told[:2]) and told[3] not in line

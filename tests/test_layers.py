@@ -41,7 +41,7 @@ LAYERS = (
     [("saved",)],
     [("training",), ("report",)],
     [("command",), ("gym",)],
-    [("train",), ("evaluate",), ("plot",)],
+    [("train",), ("evaluate",), ("plot",), ("__main__",)],
 )
 BESIDE = {("agents", "experience")}  # the groups of one layer of which the first may import the second
 

@@ -226,6 +226,13 @@ def test_worlds_that_are_lost_often_are_a_bad_step():
     np.testing.assert_array_equal(metrics["bad_step"], [[-1, 1]])
 
 
+def test_one_lost_world_stops_no_run_however_short_its_chunks():
+    """Though it is more than one in 10,000 steps."""
+    _, (metrics,) = train(Lost(share=0.1), Recorder(), {**SETTINGS, "stagger": False})
+    np.testing.assert_array_equal(metrics["lost"], [[0, 1]])
+    np.testing.assert_array_equal(metrics["bad_step"], [[-1, -1]])
+
+
 # With an agent that learns.
 
 SMALL = dict(num_envs=2, batch_size=4, replay_size=12, warmup_steps=4, chunk_steps=4)  # one chunk of warm-up

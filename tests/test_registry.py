@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import json
+import re
 import shlex
 import sys
 from functools import partial
@@ -487,6 +488,29 @@ def test_an_agent_with_other_defaults_names_its_file(forget, tmp_path):
     config = run_config.parse([flag, "--agent=my-care"])
     assert config.imports == (str(file),) and flag in to_flags(config)
     assert keywords.configured("finger-spin", "my-care", {}, plan={}).imports == (str(file),)
+
+
+@pytest.mark.parametrize(
+    "text, flag, named",
+    [
+        (
+            "class Spring(mtjax.envs.Domain): pass",
+            "--env=spring",
+            "your Spring has no name: call mtjax.register('spring', Spring)",
+        ),
+        (
+            "class Mine(mtjax.agents.SAC): pass",
+            "--agent=mine",
+            "your Mine has no name: call mtjax.register('mine', Mine)",
+        ),
+    ],
+)
+def test_own_classes_without_a_name_are_told_how_to_get_one(text, flag, named, forget, tmp_path):
+    """Where a file defines a class, and calls nothing."""
+    file = tmp_path / "own_nameless.py"
+    file.write_text(f"import mtjax\n\n{text}\n")
+    with pytest.raises(InputError, match=re.escape(named)):
+        run_config.parse([f"--import={file}", flag])
 
 
 def test_unknown_names_of_a_run_mention_import(tmp_path):

@@ -7,6 +7,7 @@ import errno
 import io
 import itertools
 import json
+import math
 import os
 import pathlib
 import pickle
@@ -726,9 +727,24 @@ def test_plan_refuses_numbers_that_mean_nothing(field):
 def test_chunks_are_no_longer_than_the_run():
     """Whole iterations, at least as many as the steps need."""
     assert fit_chunk(Settings(num_envs=2, chunk_steps=1000), 3, 601).chunk_steps == 101
-    assert fit_chunk(Settings(num_envs=2, chunk_steps=10), 3, 601).chunk_steps == 10
-    assert fit_chunk(Settings(num_envs=2, chunk_steps=60), 3, 601).chunk_steps == 51  # two chunks of 101 steps
+    assert fit_chunk(Settings(num_envs=2, chunk_steps=10), 3, 601).chunk_steps == 6  # 102 iterations, not 110
     assert fit_chunk(Settings(num_envs=2, chunk_steps=60), 3, 601, grain=32).chunk_steps == 64
+    assert fit_chunk(Settings(num_envs=16, chunk_steps=62), 10, 100_000).chunk_steps == 25  # 625 in 25 chunks
+    assert fit_chunk(Settings(num_envs=2048, chunk_steps=512), 1, 10**7, grain=32).chunk_steps == 9 * 32  # 153 of 32
+    assert fit_chunk(Settings(num_envs=2, chunk_steps=10**9), 3, 10**15).chunk_steps > 10**8  # at once
+
+
+def test_a_run_is_hardly_longer_than_its_steps():
+    """By less than an iteration of all worlds and 2%; chunks are at most 50, or four times as many as are needed."""
+    random = np.random.default_rng(0)
+    for _ in range(1000):
+        tasks, envs, chunk, grain = (int(random.integers(1, most)) for most in (20, 100, 2000, 40))
+        steps = int(10 ** random.uniform(0, 9))
+        length = fit_chunk(Settings(num_envs=envs, chunk_steps=chunk), tasks, steps, grain).chunk_steps
+        worlds, count = tasks * envs, math.ceil(steps / (length * tasks * envs))
+        assert length % grain == 0 and length < chunk + grain
+        assert count * length * worlds < 1.02 * steps + grain * worlds
+        assert count <= max(50, 4 * math.ceil(math.ceil(steps / (worlds * grain)) / math.ceil(chunk / grain)))
 
 
 @pytest.mark.parametrize("plan, every", [(Plan(5), 1), (Plan(101), 11), (Plan(100), 10), (Plan(100, eval_every=7), 7)])

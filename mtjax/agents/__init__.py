@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mtjax.checks import shown
-from mtjax.names import CHOICES, InputError, frozen, lazily, load, nearest_error, public
+from mtjax.names import CHOICES, InputError, describe_unnamed, frozen, lazily, load, nearest_error, public
 
 if TYPE_CHECKING:
     from mtjax.agents.base import BaseAgent
@@ -133,7 +133,8 @@ def preset_of(name: str) -> Preset:
     if not isinstance(name, str):
         raise InputError(f"an agent is chosen by name, such as 'care', not by {shown(name)}")
     if name not in AGENTS:
-        raise nearest_error("agent", name, AGENTS)
+        own = describe_unnamed("mtjax.agents.base:BaseAgent", name, [preset.place for preset in AGENTS.values()])
+        raise nearest_error("agent", name, AGENTS, own)
     return AGENTS[name]
 
 

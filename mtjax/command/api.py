@@ -67,8 +67,8 @@ def train(
         env: the family, as ``mtjax.make`` returns it, or its name; it trains on ``env.tasks("train")``.
         agent: the learner, as ``mtjax.agent`` returns it, or its name. A name brings the tuned settings of the command
             line. None takes the agent of ``start``.
-        steps: environment steps of each seed, summed over tasks. They are rounded up to whole chunks. None takes the
-            preset's if both are names, else a million.
+        steps: environment steps of each seed, summed over tasks. They are rounded up to whole steps or rollouts of all
+            worlds, in chunks of one length. None takes the preset's if both are names, else a million.
         seeds: how many seeds to train at once.
         seed: the first seed.
         eval_every: environment steps between evaluations. 0 means ten evaluations in the run.

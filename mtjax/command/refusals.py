@@ -6,15 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from mtjax.agents import AGENTS
+from mtjax.agents import AGENTS, preset_of
 from mtjax.checks import require_run
 from mtjax.command.class_sources import all_flags, as_flag, whole_flags
 from mtjax.command.flags import VARY, flag_value, is_whole, switched_off, switched_on, with_port
-from mtjax.envs import BENCHMARKS, ENVS, members
+from mtjax.envs import ENVS, members, unknown_name
 from mtjax.names import PRESETS, InputError, nearest_error
 from mtjax.saved import pretrained
 
-_KNOWN = (("environment", "env", ENVS), ("agent", "agent", AGENTS), ("preset", "preset", PRESETS))
 _MAY_CHANGE = {  # the only flags beside --resume
     *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--view", "--wandb")
 }
@@ -27,14 +26,14 @@ def check_names(argv: Sequence[str]) -> None:
         InputError: there is no such name or folder, or --resume came with flags that change the run.
     """
     argv = with_port(argv)
-    for kind, flag, known in _KNOWN:
-        given = flag_value(argv, flag, None)
-        if given is None:
-            continue
-        names = [name for name, _ in members(given)] if flag == "env" else [given]  # a mixture has several
-        wrong = next((name for name in names if name not in known), None)
+    if (env := flag_value(argv, "env", None)) is not None:
+        wrong = next((name for name, _ in members(env) if name not in ENVS), None)  # a mixture has several
         if wrong is not None:
-            raise nearest_error(kind, wrong, (*known, *BENCHMARKS) if flag == "env" else known)
+            raise unknown_name(wrong)
+    if (agent := flag_value(argv, "agent", None)) is not None:
+        preset_of(agent)
+    if (preset := flag_value(argv, "preset", "auto")) not in PRESETS:
+        raise nearest_error("preset", preset, PRESETS)
     _check_numbers(argv)
     given = {word.split("=", 1)[0] for word in argv if word.startswith("--")}
     other = ", ".join(sorted(given - _MAY_CHANGE))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mtjax.checks import OF_TRAIN, checked, require_text, shown
 from mtjax.envs import variation
 from mtjax.envs.metaworld.names import BENCHMARKS, FAMILIES
-from mtjax.names import InputError, first_sentence, frozen, lazily, load, nearest_error, public
+from mtjax.names import InputError, describe_unnamed, first_sentence, frozen, lazily, load, nearest_error, public
 
 if TYPE_CHECKING:
     from mtjax.envs.domain import Domain
@@ -295,7 +295,7 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
     if is_mixture(name):
         return _make_mixture(members(name), _pairs(vary), dict(settings))
     if name not in ENVS:
-        raise _unknown_name(name)
+        raise unknown_name(name)
     family, defaults = ENVS[name]
     fields = [field.name for field in dataclasses.fields(family)]
     unknown = next((s for s in (*settings, *defaults) if s not in fields), None)
@@ -320,7 +320,7 @@ def make_from(env: Any, given: Mapping[str, Any]) -> tuple[str, Any, dict[str, A
     names = [name for name, _ in members(env)]
     unknown = next((name for name in names if name not in ENVS), None)
     if unknown is not None:
-        raise _unknown_name(unknown)
+        raise unknown_name(unknown)
     own = {field.name for name in names for field in dataclasses.fields(ENVS[name][0])}
     rest = {name: value for name, value in given.items() if name not in own}
     return env, make(env, **{name: value for name, value in given.items() if name in own}), rest
@@ -359,10 +359,11 @@ def _pairs(vary: Any) -> dict[str, Any]:
         ) from None
 
 
-def _unknown_name(name: str) -> InputError:
+def unknown_name(name: str) -> InputError:
     """Return an error for a name of no environment."""
     suites = [f"{suite}:NAME" for suite in SUITES]
-    return nearest_error("environment", name, (*ENVS, *BENCHMARKS, *suites))
+    own = describe_unnamed("mtjax.envs.family:Family", name, [home for home, _ in ENVS.data.values()])
+    return nearest_error("environment", name, (*ENVS, *BENCHMARKS, *suites), own)
 
 
 def _unknown_setting(name: str, family: Any, unknown: str, value: Any) -> InputError:

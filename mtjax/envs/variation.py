@@ -124,6 +124,15 @@ def write_values(given: str | float | Sequence[float], name: str = "a parameter"
     return ",".join(repr(float(x)) for x in points)
 
 
+def require_allowed(name: str, numbers: Iterable[float], parameter: Parameter) -> None:
+    """Raise InputError where a number is outside a parameter's range."""
+    wrong = next((x for x in numbers if not abs(x) <= _LARGEST or not _allowed(x, parameter)), None)
+    if wrong is not None:
+        most = min(parameter.maximum, _LARGEST)
+        limit = f" and at most {most:g}" if most < _LARGEST or not wrong <= most else ""
+        raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
+
+
 def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
     """Read "lo:hi:n", "lo:hi" or "a,b,c".
 
@@ -145,11 +154,7 @@ def read_axis(name: str, text: str, parameter: Parameter) -> Axis:
     if len(parts) == 3 and count < 2:
         asked = "one value" if count == 1 else f"{count} values"
         raise InputError(f"{text} asks for {asked} of {name}; give it alone, or a range of at least two")
-    wrong = next((x for x in numbers if not abs(x) <= _LARGEST or not _allowed(x, parameter)), None)
-    if wrong is not None:
-        most = min(parameter.maximum, _LARGEST)
-        limit = f" and at most {most:g}" if most < _LARGEST or not wrong <= most else ""
-        raise InputError(f"{name} must be greater than {parameter.minimum:g}{limit}, not {wrong:g}")
+    require_allowed(name, numbers, parameter)
     points = np.linspace(numbers[0], numbers[1], count) if len(parts) == 3 else np.array(numbers)
     if parameter.names and (len(parts) == 2 or np.any(points % 1)):
         told = ", ".join(f"{i} ({called})" for i, called in enumerate(parameter.names))

@@ -193,7 +193,8 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         environment's (S, T), as means over these episodes' last steps; the agent's, as means (S, T) or (S,) over the
         chunk; "lost" (S, T), how often a world was lost (``step_envs``), whose episode does not count; "bad_step"
         (S, T), the first step whose numbers were not finite, or -1; "bad_reward" (S, T) that whose reward was not.
-        Worlds that are lost at more than one in 10,000 steps of a task count as numbers that are not finite.
+        Worlds that are lost more than once, and at more than one in 10,000 steps of a task, count as numbers that are
+        not finite.
     """
     experience, known = agent.experience, tasks
     if settings.plays.steps:
@@ -485,7 +486,7 @@ def _summarise(history: dict, count: int) -> Metrics:
     bad, unrewarded, lost = jnp.int32(~history["finite"]), jnp.int32(~history["rewarded"]), history["lost"]
     counts = collectives.total((finished, total, metrics, bad, unrewarded, lost))
     episodes, total, metrics, bad, unrewarded, lost = counts
-    often = over_steps(lost) > _MOST_LOST * count
+    often = over_steps(lost) > max(_MOST_LOST * count, 1)  # a short chunk may lose a world too
     bad = (bad > 0) | (often & (lost > 0))
     # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)

@@ -21,6 +21,7 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.contexts import ranges
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import FamilyOrMixture
+from mtjax.envs.variation import require_allowed
 from mtjax.experience.ring import Ring
 from mtjax.learning import loop
 from mtjax.names import public
@@ -112,6 +113,9 @@ class Policy:
             raise InputError("a policy of a mixture takes a task: policy(obs, task)")
         names = [name for name, _, _ in ranges(self.env)]
         values = standalone.ordered(names, parameters, bool(parameters) or self._reads_parameters, size)
+        for name, value in zip(names, values, strict=True):
+            if parameters and name in self.env.parameters and not isinstance(value, jax.core.Tracer):
+                require_allowed(name, np.ravel(value).tolist(), self.env.parameters[name])
         each = any(map(np.ndim, values))
         values = jnp.stack(jnp.broadcast_arrays(*map(jnp.float32, values)), axis=-1) if values else jnp.zeros(0)
         return (jax.vmap(self.task_of) if each else self.task_of)(values), each

@@ -171,7 +171,7 @@ def describe_resumption(steps: int, total: int, again: int = 0) -> str:
 
 
 def describe_rounding(steps: int, total: int, chunk: int) -> list[str]:
-    """Return a line if a run's steps are rounded up to whole chunks."""
+    """Return a line if a run's steps are rounded up, to whole chunks of all worlds."""
     return [f"{steps:,} steps are rounded up to {total:,}, whole chunks of {chunk:,}"] if total > steps else []
 
 
