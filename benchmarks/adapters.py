@@ -4,9 +4,10 @@
 
 Ours is a chunk of ``mtjax.train`` for an agent that acts at random and learns nothing: it acts in every world by a key
 of its own, steps, begins ended episodes anew, sums returns, and looks for numbers that are not finite. Theirs is a scan
-of the package's step, mapped over worlds, with its automatic reset and random actions. Both are compiled first and then
-timed in turn, round after round, in one process, so that other load on the machine affects both. Figures are medians
-over rounds, and ratios are medians of each round's ratio.
+of the package's step, mapped over worlds, with its automatic reset and random actions; of EnvPool a loop in Python over
+``step`` of one pool. Both are compiled first and then timed in turn, round after round, in one process, so that other
+load on the machine affects both. Figures are medians over rounds, and ratios are medians of each round's ratio, of
+seconds and of the CPU seconds of the process.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from report import publish, run_main
 from training import Training
 
@@ -42,6 +44,7 @@ CONTESTS = {
     "gymnax:Asterix-MinAtar": Contest(1024, 256),
     "xminigrid:MiniGrid-DoorKey-8x8": Contest(512, 256),
     "craftax:Craftax-Classic-Symbolic-v1": Contest(256, 64),
+    "envpool:Pong-v5": Contest(64, 64),
 }
 
 
@@ -89,7 +92,10 @@ def main() -> None:
     rows = []
     for name in arguments.names:
         rows.append(compare(name, arguments.repeats))
-        print("{environment}: ours {ours:,.0f}, theirs {theirs:,.0f} steps/s; ratio {ratio:.2f}".format(**rows[-1]))
+        line = (
+            "{environment}: ours {ours:,.0f}, theirs {theirs:,.0f} steps/s; ratio {ratio:.2f}, of CPU {cpu_ratio:.2f}"
+        )
+        print(line.format(**rows[-1]), flush=True)
     publish(arguments, rows)
 
 
@@ -98,22 +104,28 @@ def compare(name: str, repeats: int) -> dict[str, Any]:
     contest, family = CONTESTS[name], mtjax.make(name)
     settings = Settings(num_envs=contest.worlds, chunk_steps=contest.steps)
     training: Any = Training(family, Chance(family.spec.action), settings, most_devices=1)  # type: ignore
-    theirs, seconds = own_scan(name, family.spec.action, contest), []
-    for _ in range(repeats):
-        training.time()
-        before = time.perf_counter()
-        theirs()
-        seconds.append(time.perf_counter() - before)
-    ratios = [own / our for our, own in zip(training.seconds, seconds, strict=True)]
+    make = own_pool if name.startswith("envpool:") else own_scan
+    theirs = make(name, family.spec.action, contest)
+    rounds = [(timed(training.time), timed(theirs)) for _ in range(repeats)]
+    (seconds, cpu), (own, own_cpu) = (zip(*times, strict=True) for times in zip(*rounds, strict=True))
+    ratios = [theirs / ours for ours, theirs in zip(seconds, own, strict=True)]
     count = contest.worlds * contest.steps
     return {
         "environment": name,
         **contest._asdict(),
-        "ours": count / statistics.median(training.seconds),
-        "theirs": count / statistics.median(seconds),
+        "ours": count / statistics.median(seconds),
+        "theirs": count / statistics.median(own),
         "ratio": statistics.median(ratios),
         "ratios": [round(x, 3) for x in sorted(ratios)],
+        "cpu_ratio": statistics.median(theirs / ours for ours, theirs in zip(cpu, own_cpu, strict=True)),
     }
+
+
+def timed(run: Callable[[], Any]) -> tuple[float, float]:
+    """Return the seconds, and the CPU seconds of this process, that a call takes."""
+    before = time.perf_counter(), time.process_time()
+    run()
+    return time.perf_counter() - before[0], time.process_time() - before[1]
 
 
 def own_scan(name: str, action: Action, contest: Contest) -> Callable[[], Any]:
@@ -139,6 +151,22 @@ def own_scan(name: str, action: Action, contest: Contest) -> Callable[[], Any]:
     def run() -> None:
         held[0], _ = jax.block_until_ready(program(held[0]))
 
+    return run
+
+
+def own_pool(name: str, action: Any, contest: Contest) -> Callable[[], Any]:
+    """Return EnvPool's contestant: a call that steps a pool with its own settings and single pictures."""
+    import envpool
+
+    pool = envpool.make(name.partition(":")[2], env_type="gymnasium", num_envs=contest.worlds, stack_num=1)
+    pool.reset()
+    random = np.random.default_rng(0)
+
+    def run() -> None:
+        for _ in range(contest.steps):
+            pool.step(random.integers(0, action.size, contest.worlds))
+
+    run()
     return run
 
 
