@@ -53,7 +53,7 @@ class Chance:
     """An agent that acts at random and learns nothing."""
 
     action: Action
-    experience: Rollouts = Rollouts(unroll=32, epochs=1, minibatches=1)
+    experience: Rollouts
 
     unroll: ClassVar[int] = 0
     continual: ClassVar[Continual] = Continual()
@@ -103,7 +103,8 @@ def compare(name: str, repeats: int) -> dict[str, Any]:
     """Time our loop and the package's own scan in turn."""
     contest, family = CONTESTS[name], mtjax.make(name)
     settings = Settings(num_envs=contest.worlds, chunk_steps=contest.steps)
-    training: Any = Training(family, Chance(family.spec.action), settings, most_devices=1)  # type: ignore
+    agent: Any = Chance(family.spec.action, Rollouts(unroll=32, epochs=1, minibatches=1))
+    training = Training(family, agent, settings, most_devices=1)
     make = own_pool if name.startswith("envpool:") else own_scan
     theirs = make(name, family.spec.action, contest)
     rounds = [(timed(training.time), timed(theirs)) for _ in range(repeats)]
