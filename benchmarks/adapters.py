@@ -157,7 +157,7 @@ def own_scan(name: str, action: Action, contest: Contest) -> Callable[[], Any]:
 
 def own_pool(name: str, action: Any, contest: Contest) -> Callable[[], Any]:
     """Return EnvPool's contestant: a call that steps a pool with its own settings and single pictures."""
-    import envpool
+    import envpool  # type: ignore  # not a dependency of this package
 
     pool = envpool.make(name.partition(":")[2], env_type="gymnasium", num_envs=contest.worlds, stack_num=1)
     pool.reset()
@@ -173,7 +173,7 @@ def own_pool(name: str, action: Any, contest: Contest) -> Callable[[], Any]:
 
 def gymnax(name: str) -> tuple[Callable, Callable]:
     """Return reset and step of an environment of gymnax, which resets by itself."""
-    import gymnax
+    import gymnax  # type: ignore  # not a dependency of this package
 
     env, params = gymnax.make(name)
     return lambda key: env.reset(key, params)[1], lambda key, state, action: env.step(key, state, action, params)[:3]
@@ -181,8 +181,8 @@ def gymnax(name: str) -> tuple[Callable, Callable]:
 
 def xminigrid(name: str) -> tuple[Callable, Callable]:
     """Return reset and step of an environment of XLand-MiniGrid, whose state holds its key."""
-    import xminigrid
-    from xminigrid.wrappers import GymAutoResetWrapper
+    import xminigrid  # type: ignore  # not a dependency of this package
+    from xminigrid.wrappers import GymAutoResetWrapper  # type: ignore  # not a dependency of this package
 
     env, params = xminigrid.make(name)
     env = GymAutoResetWrapper(env)
@@ -196,7 +196,7 @@ def xminigrid(name: str) -> tuple[Callable, Callable]:
 
 def craftax(name: str) -> tuple[Callable, Callable]:
     """Return reset and step of an environment of Craftax, which resets by itself."""
-    from craftax.craftax_env import make_craftax_env_from_name
+    from craftax.craftax_env import make_craftax_env_from_name  # type: ignore  # not a dependency of this package
 
     env = make_craftax_env_from_name(name, auto_reset=True)
     params = env.default_params
