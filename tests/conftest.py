@@ -69,13 +69,23 @@ def read_classes_once():
 def lower_many_in_one_context():
     """Lower 50 programs in one MLIR context. JAX makes one for each, which is a sixth of what a small program costs.
 
-    A context keeps all constants and types that it has seen, so that it may not live for ever.
+    A context keeps all constants and types that it has seen, so that it may not live for ever. What is lowered in the
+    midst of another lowering has one of its own: copies of modules would land in the unfinished one otherwise.
     """
     mlir = sys.modules.get("jax._src.interpreters.mlir")
     make, made = getattr(mlir, "make_ir_context", None), count()
-    if mlir is not None and make is not None:  # JAX may change what is its own
+    context = getattr(getattr(mlir, "ir", None), "Context", None)
+    if mlir is not None and make is not None and context is not None:  # JAX may change what is its own
         of_number = lru_cache(1)(lambda number: make())
-        mlir.make_ir_context = lambda: of_number(next(made) // 50)
+        mlir.make_ir_context = lambda: make() if is_current(context) else of_number(next(made) // 50)
+
+
+def is_current(context) -> bool:
+    """Return whether a context of a class is at work in this thread."""
+    try:
+        return context.current is not None
+    except ValueError:
+        return False
 
 
 def trace_initialisers_once():

@@ -188,6 +188,12 @@ def require_one_form(name):
     return family
 
 
+def test_packages_may_compute_as_they_are_traced():
+    """JAX then compiles one program in the midst of lowering another."""
+    with jax.ensure_compile_time_eval():
+        assert jax.random.bernoulli(jax.random.key(0), shape=(7, 11, 3)).shape == (7, 11, 3)
+
+
 @needs("gymnax")
 def test_every_environment_of_gymnax_that_needs_no_download_can_be_stepped():
     import gymnax

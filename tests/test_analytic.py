@@ -12,6 +12,7 @@ from probes import QUICK, Stub
 
 import mtjax
 from mtjax.envs.analytic import link, sailing, tracks, trading
+from mtjax.envs.analytic.circle import cos_sin
 from mtjax.learning.evaluation import record
 from mtjax.learning.rollout import reset_envs, step_envs
 from mtjax.report import films, render
@@ -111,6 +112,19 @@ def close(steps, expected, tolerance):
 
 
 # Equations.
+
+
+@pytest.mark.parametrize("largest", [1, 4, 1000])
+def test_cosine_and_sine_are_numpys(largest):
+    """And so are their slopes; what is no number stays none."""
+    angles = np.float32(np.linspace(-largest, largest, 20_001))
+    cos, sin = jax.jit(cos_sin)(angles)
+    np.testing.assert_allclose(cos, np.cos(np.float64(angles)), atol=1e-7)
+    np.testing.assert_allclose(sin, np.sin(np.float64(angles)), atol=1e-7)
+    (of_cos, of_sin) = jax.jvp(cos_sin, (angles,), (np.ones_like(angles),))[1]
+    np.testing.assert_allclose(of_cos, -sin, atol=1e-6)
+    np.testing.assert_allclose(of_sin, cos, atol=1e-6)
+    assert np.all(np.isnan(cos_sin(jnp.float32([np.nan, np.inf]))))
 
 
 def test_a_link_is_a_fluid_queue():

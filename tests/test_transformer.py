@@ -187,14 +187,17 @@ def test_the_policy_that_learns_is_the_one_that_played(way):
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 def test_it_explores_as_well_as_can_be():
-    """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67."""
+    """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67.
+
+    In two evaluations of 2,000 trials each, half-way and at the end, whose mean is sure to .03.
+    """
     pulls, trials = 10, 2000
     known = {"conditioning": "transformer", "transformer_size": 32, "attended_steps": pulls}
     given = dict(unroll=pulls, minibatches=4, gamma=1.0, actor_lr=1e-3, entropy_cost=0.01)
-    agent, steps = mtjax.agent("rl2", hidden=(32, 32), **known, **given), 300 * 256 * pulls
-    plan = dict(steps=steps, eval_every=steps, eval_episodes=trials * pulls, chunk_steps=100 * pulls)
+    agent, steps = mtjax.agent("rl2", hidden=(32, 32), **known, **given), 150 * 256 * pulls
+    plan = dict(steps=steps, eval_every=steps // 2, eval_episodes=trials * pulls, chunk_steps=75 * pulls)
     result = mtjax.train(mtjax.make("hidden-bandit"), agent, trials=pulls, num_envs=256, quiet=True, **plan)
-    found = result.evaluations.returns["train"][0, -1, 0].reshape(trials, pulls).sum(axis=1).mean()
+    found = result.evaluations.returns["train"][0, -2:, 0].reshape(-1, pulls).sum(axis=1).mean()
     assert found > 0.97 * exact.bandit(2, pulls)
 
 

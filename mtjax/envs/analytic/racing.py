@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mtjax.envs.analytic.circle import cos_sin
 from mtjax.envs.analytic.tracks import Line, line_at, make_track, outline
 from mtjax.envs.family import Family
 from mtjax.envs.looks import WITHOUT_CAMERA, Look
@@ -140,20 +141,20 @@ class Racing(Pictured, Family):
         """Return the motion of the car, where it is on the track, and the bends ahead."""
         waves, angle = task.goal["waves"], jnp.arctan2(state.place[1], state.place[0])
         line = line_at(waves, angle)
-        off = state.heading - line.heading
+        (along, across), (forward, left) = cos_sin(state.heading - line.heading), cos_sin(state.slip)
         bends, ahead = [], line
         for _ in range(_AHEAD):
             angle = angle + _SPACING / ahead.pace
             ahead = line_at(waves, angle)
             bends.append(3 * ahead.curvature)
         motion = [
-            state.speed * jnp.cos(state.slip) / 10,
-            state.speed * jnp.sin(state.slip) / 10,
+            state.speed * forward / 10,
+            state.speed * left / 10,
             state.turning / 5,
             state.steer / _LARGEST_STEER,
             _offset(state, line) / (task.goal["width"] / 2),
-            jnp.sin(off),
-            jnp.cos(off),
+            across,
+            along,
         ]
         return jnp.stack([*motion, *bends])
 
@@ -235,7 +236,7 @@ def _move(task: Task, state: CarState, steer: Array, push: Array, h: float) -> C
     turning = (slip_slip * to_turn - turn_slip * to_slip) / whole
     heading = state.heading + h * turning
     moves = heading + slip
-    place = state.place + h * speed * jnp.stack([jnp.cos(moves), jnp.sin(moves)])
+    place = state.place + h * speed * jnp.stack(cos_sin(moves))
     return state._replace(place=place, heading=heading, speed=speed, slip=slip, turning=turning, steer=steer)
 
 

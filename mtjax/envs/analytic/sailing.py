@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mtjax.envs.analytic.circle import cos_sin
 from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, not_negative, positive
@@ -183,12 +184,13 @@ def _move(task: Task, state: BoatState, rudder: Array, h: float) -> BoatState:
     ahead, wind, speed = _unit(state.heading), _wind(task), state.speed
     wx, wy = _seen(ahead, wind)
     wx = wx - speed
-    sin, cos = -jnp.sign(wy) * jnp.sin(state.sheet), jnp.cos(state.sheet)
+    (cos, sin), (along, across) = cos_sin(state.sheet), cos_sin(rudder)
+    sin = -jnp.sign(wy) * sin
     flaps = wx + jnp.sqrt(wx * wx + wy * wy) * cos < 0
     pull = jnp.where(flaps, 0.0, _SAIL * task.goal["sail"] * (wx * sin - wy * cos))
-    side = _RUDDER * speed * jnp.sin(rudder)  # the rudder's force over the speed
-    drag = (_DRAG * speed + _RUDDER_DRAG * side * jnp.sin(rudder)) / _MASS
-    torque = pull * (_EFFORT - _MAST * cos) - _STERN * side * speed * jnp.cos(rudder)
+    side = _RUDDER * speed * across  # the rudder's force over the speed
+    drag = (_DRAG * speed + _RUDDER_DRAG * side * across) / _MASS
+    torque = pull * (_EFFORT - _MAST * cos) - _STERN * side * speed * along
     speed = (speed + h * pull * sin / _MASS) / (1 + h * drag)
     turning = (state.turning + h * torque / _INERTIA) / (1 + h * _SPIN_DRAG * state.speed / _INERTIA)
     heading = state.heading + h * turning
@@ -197,7 +199,7 @@ def _move(task: Task, state: BoatState, rudder: Array, h: float) -> BoatState:
 
 
 def _unit(angle: Array) -> Array:
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    return jnp.stack(cos_sin(angle))
 
 
 def _seen(ahead: Array, vector: Array) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.envs.analytic.circle import cos_sin
 from mtjax.types import Array
 
 _RADIUS = 13.0  # [m] on average
@@ -50,7 +51,7 @@ def line_at(waves: Array, angle: Array) -> Line:
 def _line(waves: Any, angle: Any, xp: Any) -> Line:
     """Return the line, by the radius and its first two derivatives. ``xp`` is NumPy or JAX, as the waves are."""
     radius, slope, bend = xp.ones_like(angle), 0.0, 0.0
-    first = xp.cos(angle), xp.sin(angle)
+    first = (np.cos(angle), np.sin(angle)) if xp is np else cos_sin(angle)
     cos, sin = first
     for k in range(2, _WAVES[-1] + 1):
         cos, sin = cos * first[0] - sin * first[1], sin * first[0] + cos * first[1]

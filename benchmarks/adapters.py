@@ -1,0 +1,209 @@
+"""Compare environment steps a second of our loop with those of other packages' own scans, with as many worlds.
+
+    python benchmarks/adapters.py [--names NAME ...] [--repeats N] [--json FILE]
+
+Ours is a chunk of ``mtjax.train`` for an agent that acts at random and learns nothing: it acts in every world by a key
+of its own, steps, begins ended episodes anew, sums returns, and looks for numbers that are not finite. Theirs is a scan
+of the package's step, mapped over worlds, with its automatic reset and random actions; of EnvPool a loop in Python over
+``step`` of one pool. Both are compiled first and then timed in turn, round after round, in one process, so that other
+load on the machine affects both. Figures are medians over rounds, and ratios are medians of each round's ratio, of
+seconds and of the CPU seconds of the process.
+"""
+
+import argparse
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from report import publish, run_main
+from training import Training
+
+import mtjax
+from mtjax.agents.parts.continual import Continual
+from mtjax.agents.parts.plasticity import Plasticity
+from mtjax.experience import Rollouts
+from mtjax.learning.loop import Settings
+from mtjax.types import Acted, Action, Metrics
+
+
+class Contest(NamedTuple):
+    """What is timed of an environment."""
+
+    worlds: int
+    steps: int  # of every world in a timed call, a multiple of a rollout's
+
+
+CONTESTS = {
+    "gymnax:CartPole-v1": Contest(1024, 1024),
+    "gymnax:Breakout-MinAtar": Contest(1024, 512),
+    "gymnax:Asterix-MinAtar": Contest(1024, 256),
+    "xminigrid:MiniGrid-DoorKey-8x8": Contest(512, 256),
+    "craftax:Craftax-Classic-Symbolic-v1": Contest(256, 64),
+    "envpool:Pong-v5": Contest(64, 64),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Chance:
+    """An agent that acts at random and learns nothing."""
+
+    action: Action
+    experience: Rollouts
+
+    unroll: ClassVar[int] = 0
+    continual: ClassVar[Continual] = Continual()
+    plasticity: ClassVar[Plasticity] = Plasticity()
+    goes_on: ClassVar[bool] = False
+    taught: ClassVar[bool] = False
+
+    def init(self, spec: Any, tasks: Any, key: Any) -> Any:
+        return jnp.zeros(1)
+
+    def begin(self, state: Any, task: Any) -> Any:
+        return ()
+
+    def act(self, state: Any, memory: Any, obs: Any, task: Any, key: Any) -> Acted:
+        return Acted(self.action.random(key))
+
+    def remember(self, state: Any, memory: Any, transition: Any, task: Any) -> Any:
+        return memory
+
+    def assess(self, state: Any, steps: Any, tasks: Any) -> tuple[Any, Any]:
+        return state, steps
+
+    def update(self, state: Any, window: Any, tasks: Any, key: Any, number: Any) -> tuple[Any, Metrics]:
+        return state, {}
+
+    def observe(self, state: Any, steps: Any, tasks: Any) -> Any:
+        return state
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--names", nargs="*", default=list(CONTESTS), choices=CONTESTS)
+    parser.add_argument("--repeats", type=int, default=7, help="rounds")
+    parser.add_argument("--json", help="write the figures to this file too")
+    arguments = parser.parse_args()
+    rows = []
+    for name in arguments.names:
+        rows.append(compare(name, arguments.repeats))
+        line = (
+            "{environment}: ours {ours:,.0f}, theirs {theirs:,.0f} steps/s; ratio {ratio:.2f}, of CPU {cpu_ratio:.2f}"
+        )
+        print(line.format(**rows[-1]), flush=True)
+    publish(arguments, rows)
+
+
+def compare(name: str, repeats: int) -> dict[str, Any]:
+    """Time our loop and the package's own scan in turn."""
+    contest, family = CONTESTS[name], mtjax.make(name)
+    settings = Settings(num_envs=contest.worlds, chunk_steps=contest.steps)
+    agent: Any = Chance(family.spec.action, Rollouts(unroll=32, epochs=1, minibatches=1))
+    training = Training(family, agent, settings, most_devices=1)
+    make = own_pool if name.startswith("envpool:") else own_scan
+    theirs = make(name, family.spec.action, contest)
+    rounds = [(timed(training.time), timed(theirs)) for _ in range(repeats)]
+    (seconds, cpu), (own, own_cpu) = (zip(*times, strict=True) for times in zip(*rounds, strict=True))
+    ratios = [theirs / ours for ours, theirs in zip(seconds, own, strict=True)]
+    count = contest.worlds * contest.steps
+    return {
+        "environment": name,
+        **contest._asdict(),
+        "ours": count / statistics.median(seconds),
+        "theirs": count / statistics.median(own),
+        "ratio": statistics.median(ratios),
+        "ratios": [round(x, 3) for x in sorted(ratios)],
+        "cpu_ratio": statistics.median(theirs / ours for ours, theirs in zip(cpu, own_cpu, strict=True)),
+    }
+
+
+def timed(run: Callable[[], Any]) -> tuple[float, float]:
+    """Return the seconds, and the CPU seconds of this process, that a call takes."""
+    before = time.perf_counter(), time.process_time()
+    run()
+    return time.perf_counter() - before[0], time.process_time() - before[1]
+
+
+def own_scan(name: str, action: Action, contest: Contest) -> Callable[[], Any]:
+    """Return the package's contestant: a call that goes on with all of its worlds."""
+    suite, _, own = name.partition(":")
+    reset, step = OWN[suite](own)
+
+    def play(carry: Any) -> tuple[Any, Any]:
+        def once(carry: Any, _: Any) -> tuple[Any, Any]:
+            state, key = carry
+            key, act_key, step_key = jax.random.split(key, 3)
+            actions = action.random(act_key, (contest.worlds,))
+            obs, state, reward = jax.vmap(step)(jax.random.split(step_key, contest.worlds), state, actions)
+            return (state, key), jnp.sum(reward) + sum(jnp.sum(x) for x in jax.tree.leaves(obs))
+
+        return jax.lax.scan(once, carry, length=contest.steps)
+
+    states = jax.jit(jax.vmap(reset))(jax.random.split(jax.random.key(0), contest.worlds))
+    carry = jax.tree.map(jnp.copy, (states, jax.random.key(1)))
+    program = jax.jit(play, donate_argnums=0).lower(carry).compile()
+    held = [program(carry)[0]]
+
+    def run() -> None:
+        held[0], _ = jax.block_until_ready(program(held[0]))
+
+    return run
+
+
+def own_pool(name: str, action: Any, contest: Contest) -> Callable[[], Any]:
+    """Return EnvPool's contestant: a call that steps a pool with its own settings and single pictures."""
+    import envpool  # type: ignore  # not a dependency of this package
+
+    pool = envpool.make(name.partition(":")[2], env_type="gymnasium", num_envs=contest.worlds, stack_num=1)
+    pool.reset()
+    random = np.random.default_rng(0)
+
+    def run() -> None:
+        for _ in range(contest.steps):
+            pool.step(random.integers(0, action.size, contest.worlds))
+
+    run()
+    return run
+
+
+def gymnax(name: str) -> tuple[Callable, Callable]:
+    """Return reset and step of an environment of gymnax, which resets by itself."""
+    import gymnax  # type: ignore  # not a dependency of this package
+
+    env, params = gymnax.make(name)
+    return lambda key: env.reset(key, params)[1], lambda key, state, action: env.step(key, state, action, params)[:3]
+
+
+def xminigrid(name: str) -> tuple[Callable, Callable]:
+    """Return reset and step of an environment of XLand-MiniGrid, whose state holds its key."""
+    import xminigrid  # type: ignore  # not a dependency of this package
+    from xminigrid.wrappers import GymAutoResetWrapper  # type: ignore  # not a dependency of this package
+
+    env, params = xminigrid.make(name)
+    env = GymAutoResetWrapper(env)
+
+    def step(key: Any, state: Any, action: Any) -> tuple[Any, Any, Any]:
+        state = env.step(params, state, action)
+        return state.observation, state, state.reward
+
+    return lambda key: env.reset(params, key), step
+
+
+def craftax(name: str) -> tuple[Callable, Callable]:
+    """Return reset and step of an environment of Craftax, which resets by itself."""
+    from craftax.craftax_env import make_craftax_env_from_name  # type: ignore  # not a dependency of this package
+
+    env = make_craftax_env_from_name(name, auto_reset=True)
+    params = env.default_params
+    return lambda key: env.reset(key, params)[1], lambda key, state, action: env.step(key, state, action, params)[:3]
+
+
+OWN = {"gymnax": gymnax, "xminigrid": xminigrid, "craftax": craftax}
+
+if __name__ == "__main__":
+    run_main(main)
