@@ -18,7 +18,9 @@ from mtjax.parallel import mesh as meshes
 
 SETTINGS = {"num_envs": 2, "batch_size": 4, "replay_size": 40, "warmup_steps": 4, "chunk_steps": 10, "stagger": False}
 WIDE = SETTINGS | {"num_envs": 4, "replay_size": 100}  # half full in two chunks
+SPARSE = {"n_step": 3, "update_every": 2, "policy_delay": 3}
 AGENT = tiny("sac-conditioned", hidden=(8,))
+NIGHTLY = pytest.mark.nightly
 
 
 def play(directory, env, chunks, agent=AGENT, settings=SETTINGS, **changes):
@@ -137,7 +139,7 @@ def test_devices_share_what_comes_back_from_the_host(tmp_path, use):
     assert_same(other, alone, chunks=8)
 
 
-@pytest.mark.nightly
+@NIGHTLY
 def test_checkpoint_of_one_device_goes_on_with_four(alone, tmp_path, use):
     """The other way round."""
     use(1)
@@ -148,7 +150,7 @@ def test_checkpoint_of_one_device_goes_on_with_four(alone, tmp_path, use):
     assert_same(result, alone)
 
 
-@pytest.mark.nightly
+@NIGHTLY
 def test_host_engine_serves_every_device(short_family, tmp_path, use):
     """MuJoCo C is called back from each device, and steps the worlds that it is given."""
     env = envs.make("finger-short")
@@ -196,7 +198,7 @@ def test_devices_that_share_a_seed_learn_what_one_does(wide_alone, tmp_path, cro
     assert_same(result, wide_alone)
 
 
-@pytest.mark.parametrize("given", [{}, {"n_step": 3, "update_every": 2, "policy_delay": 3}], ids=["plain", "options"])
+@pytest.mark.parametrize("given", [pytest.param({}, id="plain"), pytest.param(SPARSE, id="sparse", marks=NIGHTLY)])
 def test_two_seeds_on_two_devices_each(tmp_path, use, crowd, given):
     """With parts that watch all outcomes, hindsight, and episodes that draw their tasks."""
     agent = tiny("sac-conditioned", hidden=(8,), scaling="reward", sampler="progress", actor_lr=1e-5)

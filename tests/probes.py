@@ -205,9 +205,14 @@ def param(case, slow=False):
     return pytest.param(*values, marks=[*map(needs, packages), *([pytest.mark.slow] if slow else [])])
 
 
-def one_in(count, cases):
-    """All cases as a test's parameters, marked slow but for one in ``count``."""
-    return [param(case, slow=i % count > 0) for i, case in enumerate(cases)]
+def one_in(count, cases, nightly=False):
+    """All cases as a test's parameters, marked slow but for one in ``count``; ``nightly``: three of seven of these so.
+
+    Seven has no divisor in common with the length of most inner loops over cases, so that all values are in the rest.
+    """
+    late = lambda i: [pytest.mark.nightly] if nightly and i % count and i % 7 in (1, 3, 5) else []
+    made = [(param(case, slow=i % count > 0), late(i)) for i, case in enumerate(cases)]
+    return [pytest.param(*case.values, marks=[*case.marks, *marks]) for case, marks in made]
 
 
 def slow_but(names, *quick):
@@ -250,21 +255,23 @@ def tiny(name: str, **settings):
 
 
 @lru_cache
-def _programs(env, agent, settings: loop.Settings, num_seeds: int):
+def _programs(env, agent, settings: loop.Settings, num_seeds: int, level: int):
     tasks, seeds = env.tasks(), jnp.zeros(num_seeds, jnp.uint32)
     init = loop.init.lower(env, agent, settings, tasks, seeds).compile(QUICK)
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, tasks, seeds))
-    return init, loop.run_chunk.lower(env, agent, settings, tasks, state).compile(QUICK)
+    run_chunk = loop.run_chunk.lower(env, agent, settings, tasks, state)
+    return init, run_chunk.compile({"xla_backend_optimization_level": level})
 
 
-def train(env, agent, given: dict, *, tasks: Task | None = None, seeds=(0,), chunks: int = 1):
+def train(env, agent, given: dict, *, tasks: Task | None = None, seeds=(0,), chunks: int = 1, level: int = 0):
     """Return the training state after ``chunks`` chunks, and the metrics of each.
 
-    ``given`` are settings of the loop and of the agent by name; episodes are not staggered unless they say so.
+    ``given`` are settings of the loop and of the agent by name; episodes are not staggered unless they say so. At
+    ``level`` 1 chunks take twice as long to compile, and large networks a tenth of the time to run.
     """
     agent, settings = configure(agent, loop.Settings(stagger=False), given)
     tasks, history = env.tasks() if tasks is None else tasks, []
-    init, run_chunk = _programs(env, agent, settings, len(seeds))
+    init, run_chunk = _programs(env, agent, settings, len(seeds), level)
     state = init(tasks, jnp.asarray(seeds, jnp.uint32))
     for _ in range(chunks):
         state, metrics = run_chunk(tasks, state)

@@ -178,7 +178,7 @@ def test_varibad_learns_how_often_the_arms_of_a_bandit_pay():
         return jax.lax.scan(step, (params, optimizer.init(params)), jnp.arange(steps))[0][0]
 
     params = params_of(made, 1, 2)
-    params = jax.jit(fit)(params)
+    params = jax.jit(fit, compiler_options={"xla_backend_optimization_level": 1})(params)
     arms, reward, _ = pulls(500, length, 2)
     steps_of = track(arms, reward, KEY)
     belief = made.way.belief(params, made.over(params, steps_of)[1])

@@ -19,6 +19,7 @@ OF_AGENT = {
     "xqc": {"scaling": "none", "hidden": (64, 64), **SLOWER},
     "moe": {"num_experts": 4},
 }
+LARGE = {"brc", "simba-v2", "xqc"}
 RATES = {"tau": 0.3, "actor_lr": 3e-3, "critic_lr": 1e-2}
 
 # Q(scale, obs, action), and how far a critic may be from it: at least half as far again as the worst of five seeds.
@@ -36,7 +37,8 @@ EXPECTED = {
 def learned(name, kind, scales=SCALES, **given):
     """Train, and return the agent, its state and the tasks."""
     agent, tasks = tiny(name, **{**PLAIN, **RATES, **OF_AGENT.get(name, {})}), tasks_of(kind, scales)
-    state, _ = train(Probe(), agent, LEARNING | given, tasks=tasks, chunks=1 + (kind == "by-both"))
+    plan = dict(chunks=1 + (kind == "by-both"), level=int(name in LARGE))
+    state, _ = train(Probe(), agent, LEARNING | given, tasks=tasks, **plan)
     return agent, only_seed(state.agent), tasks
 
 
