@@ -98,7 +98,7 @@ def test_a_range_of_tasks_grows_where_its_ends_return_enough():
 def test_what_is_heard_are_means_over_seeds_and_chunks():
     """A first return counts whole; a task without an episode keeps what was heard; so do those that were not played."""
     returns = jnp.array([[2.0, jnp.nan, 8.0], [4.0, jnp.nan, jnp.nan]])
-    first = curricula.hear(curricula.nothing_heard(5), jnp.array([4, 0, 1]), returns)
+    first = curricula.hear(curricula.Hardest(1, 16).heard(5), jnp.array([4, 0, 1]), returns)
     expected = np.full((5, 2), np.nan)
     expected[4], expected[1] = 3, 8
     np.testing.assert_array_equal(first, expected)
@@ -115,7 +115,7 @@ def test_a_curriculum_hears_of_the_tasks_that_it_plays_and_changes_only_when_it_
     states, metrics = played(tiny("multi-head"), "hardest:1:16", 8, tasks, **REPLAY)
     rows = [int(state.rows[0]) for state in states[1:]]
     assert rows[::2] == rows[1::2] and set(rows) == {0, 1, 2} and rows[-1] == 1
-    heard = curricula.nothing_heard(3)
+    heard = curricula.Hardest(1, 16).heard(3)
     for row, one in zip(rows, metrics, strict=True):
         heard = curricula.hear(heard, jnp.array([row]), one["return"][:, [row]])
     np.testing.assert_allclose(states[-1].heard, heard, rtol=1e-6)

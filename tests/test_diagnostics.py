@@ -321,6 +321,7 @@ def test_agents_without_a_replay_have_diagnostics_of_a_rollout(name):
             assert seen[network].layers and seen[network].hidden.shape[0] == count
 
 
+@pytest.mark.slow
 def test_gradients_of_ppo_are_those_of_the_policy_gradient():
     """As its first ratio is 1: -mean(A grad log pi) - c grad H; and TD errors are mean |y - V|."""
     agent = tiny("ppo", hidden=(4,), unroll=6)

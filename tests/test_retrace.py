@@ -114,6 +114,7 @@ def state_of(agent):
     return loop.init(Walk(), agent, settings, Walk().tasks(), jnp.zeros(1, jnp.uint32))
 
 
+@pytest.mark.slow
 def test_actions_that_the_policy_did_not_draw_are_known():
     """The random ones of the warm-up, by what the replay holds of a run."""
     state, (metrics,) = train(Walk(), tracing("sac"), SHORT, seeds=(0, 1))
@@ -140,6 +141,7 @@ def test_variants_learn_from_windows(name, settings):
     assert np.all(metrics["bad_step"] == -1) and np.all(np.isfinite(metrics["critic_loss"]))
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_bit_for_bit(tmp_path):
     """Log-probabilities are in the checkpoint."""
 

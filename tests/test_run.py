@@ -585,10 +585,10 @@ def test_torn_metrics_do_not_stop_a_resumed_run(play, whole, tmp_path, torn):
 
 def test_second_interrupt_is_pythons_own():
     """Who insists gets out; the handlers from before come back all the same."""
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    with pytest.raises(KeyboardInterrupt), stop_signals() as received:
+    before, told = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)], []
+    with pytest.raises(KeyboardInterrupt), stop_signals(told.append) as received:
         os.kill(os.getpid(), signal.SIGINT)
-        assert received == [signal.SIGINT]
+        assert received == [signal.SIGINT] and told == ["ends after this chunk"]
         os.kill(os.getpid(), signal.SIGINT)
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
 

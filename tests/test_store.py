@@ -277,7 +277,7 @@ def test_lost_steps_are_told_and_the_run_goes_on(tmp_path):
             {"replay_size": 8, "chunk_steps": 1, "n_step": 3},
             "with host-replay-size, replay-size must be at least 12, not 8",
         ),
-        ({"chunk_steps": 30}, "keeps the latest 24 steps of every environment until a chunk ends, and one takes 30"),
+        ({"chunk_steps": 30}, "keeps the latest 24 steps of every environment until a chunk ends, and one takes 25"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(settings, message):

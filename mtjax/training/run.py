@@ -183,7 +183,8 @@ class _Run:
         self.journal.begin(steps)
         now, forgets = self._begin(programs, state, steps), bool(forgetful(self.config.family))
         earlier = now.seconds
-        with self.journal.sinks(steps) as sinks, stop_signals() as received, self.journal.records.closing():
+        doing = self.journal.console.doing
+        with self.journal.sinks(steps) as sinks, stop_signals(doing) as received, self.journal.records.closing():
             asked = lambda enough: bool(hosts.largest(int(enough or bool(received))))
             while now.steps < self.config.plan.steps and not stop:
                 self.journal.records.check()
@@ -202,7 +203,7 @@ class _Run:
                     lost = self.watch.before_saving(now.state.agent, now.steps // self.config.worlds, now.diverged)
                     now = now._replace(diverged=lost)
                 if due:
-                    self.journal.console.doing(f"{now.steps:,} steps  evaluating")
+                    doing(f"{now.steps:,} steps  evaluating")
                     now = self._select(now._replace(evaluations=self._evaluate_or_save(programs.evaluate, now)))
                     self.journal.evaluation(now.evaluations, sinks)
                     stop = asked(stop)

@@ -17,12 +17,17 @@ _HINT_REWARD = "Mend what the environment computes, such as a logarithm of 0"
 
 
 @contextlib.contextmanager
-def stop_signals() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM instead of stopping at once. A second Ctrl-C stops as usual."""
+def stop_signals(doing: Callable[[str], None] = lambda what: None) -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM instead of stopping at once. A second Ctrl-C stops as usual.
+
+    Args:
+        doing: shows what a run does now; it must be safe in a signal's handler.
+    """
     received: list[int] = []
 
     def note(number, _frame) -> None:
         received.append(number)
+        doing("ends after this chunk")
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     numbers = (signal.SIGINT, signal.SIGTERM)
