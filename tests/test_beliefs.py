@@ -57,6 +57,7 @@ def test_what_is_believed_is_what_the_policy_remembers_through_a_trial(way):
     assert way != "cadm" or not found.deviation.any()
 
 
+@pytest.mark.slow
 def test_models_foretell_what_they_predict_on_average_over_a_belief():
     """VariBAD's by draws, which of a point are all the same; what follows an episode's end is unknown."""
     made = knowing("varibad")

@@ -349,6 +349,7 @@ def test_everything_that_should_learn_does(name, settings):
             assert not np.array_equal(a[i], b[i]), f"{jax.tree_util.keystr(path)} stayed"
 
 
+@pytest.mark.slow
 def test_the_slow_encoder_follows_at_its_own_rate():
     """And so does theta; body and head take ``tau``. Models have no slow copy."""
     agent = make("hip-bmdp")

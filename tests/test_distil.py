@@ -233,6 +233,7 @@ def test_one_that_remembers_finds_out_what_its_teacher_knows():
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
+@pytest.mark.slow
 def test_the_teacher_acts_for_a_share_of_the_steps(share):
     env = Guess("by-action")
     run = told(env, [9.0, -9.0], [9.0, -9.0])  # who always takes nearly 1

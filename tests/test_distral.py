@@ -239,6 +239,7 @@ def test_all_policies_begin_as_one(batch):
     np.testing.assert_allclose(metrics["kl"], 0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_alpha_it_is_one_sac_for_every_task(state):
     """Policies, critics, slow critics and temperatures of agent ``disjoint``, update by update."""
     distral = learner(tiny("distral", distral_alpha=0.0), TASKS, BATCH, SPEC)[1]

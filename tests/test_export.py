@@ -126,6 +126,7 @@ CHEAP = [name for name in FEW if "vary" in name and name not in COSTLY][::2]
 
 
 @pytest.mark.parametrize("name", slow_but([name for name in FEW if "vary" in name], *CHEAP))
+@pytest.mark.slow
 def test_a_file_knows_every_listed_task_by_its_parameters(name):
     """By the number and by the context that the family gives it; an unlisted one has no number of theirs."""
     env = mtjax.make(name)

@@ -82,6 +82,7 @@ def test_every_form_acts_as_the_policy(name, tmp_path):
     assert np.ptp(actions, axis=1).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_the_reader_stacks_pictures_as_agents_see_them():
     obs = episode(COLOURED)["pixels"]
     stack = standalone.begin(obs[0][..., -3:], 3)
@@ -111,6 +112,7 @@ def test_a_file_tells_how_to_make_what_it_sees(file):
     assert "observation pixels (16, 16, 2), state (4,), action (2,), parameters ['hue']" in str(policy)
 
 
+@pytest.mark.slow
 def test_parameters_that_are_not_read_may_be_left_out(file, tmp_path):
     """Looks of a picture vary in training, and nobody knows them later."""
     policy, obs = standalone.load(file), jax.tree.map(lambda x: x[0], episode(BESIDE))

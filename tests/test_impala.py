@@ -80,6 +80,7 @@ def test_the_policy_that_acts_lags_behind():
 
 @pytest.mark.parametrize("lag", slow_but([0, 4], 4))
 @pytest.mark.parametrize("kind", slow_but(KNOWN, "delayed"))
+@pytest.mark.slow
 def test_probes_are_learned(kind, lag):
     """Values of every task, and the best action where there is one; also from older policies."""
     given = {"num_envs": 16, "chunk_steps": 3200, "unroll": 8, "minibatches": 2, "epochs": 2, "gamma": 0.9}

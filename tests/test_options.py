@@ -134,6 +134,7 @@ def test_the_actors_loss_has_the_gradient_of_the_return_exactly(seed):
             np.testing.assert_allclose(-ours, theirs, rtol=2e-3, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_step_moves_the_option_that_took_it_and_the_one_that_ended_alone():
     """Exactly 0 for others; and a choice that was not made moves no policy over options."""
     agent = made(entropy_cost=0.0)

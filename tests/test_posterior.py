@@ -354,6 +354,7 @@ def test_losses_reach_what_infers_the_task_where_they_may(way):
 
 
 @pytest.mark.parametrize("way", slow_but(WAYS, "pearl"))
+@pytest.mark.slow
 def test_in_sac_the_actors_loss_does_not_train_it(way):
     """An update moves all of it, and the slow copy of it follows."""
     agent = tiny("sac", recurrent_steps=4, **posterior(way))

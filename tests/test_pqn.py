@@ -179,6 +179,7 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("kind", slow_but(KNOWN, "delayed"))
+@pytest.mark.slow
 def test_probes_are_learned(kind):
     """The best value of every task, and the action that has it."""
     given = {"num_envs": 16, "chunk_steps": 1600, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}

@@ -69,6 +69,7 @@ def test_joined_steps_lead_to_the_same_values(kind):
 
 
 @pytest.mark.parametrize("kind", one_in(2, ["delayed", "endless"]))
+@pytest.mark.slow
 def test_retrace_leads_to_the_same_values(kind):
     """From windows of three steps, with ends inside: a termination ends the bootstrap, a time limit the sum alone."""
     given = {"target": "retrace", "retrace_steps": 3, "batch_size": 12}

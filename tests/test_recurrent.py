@@ -86,6 +86,7 @@ def test_the_policy_that_learns_is_the_one_that_played():
     assert history[0]["ratio"].max() < 1e-5 and np.all(history[0]["bad_step"] == -1)
 
 
+@pytest.mark.slow
 def test_each_loss_trains_the_memory_that_it_sees():
     """In PPO actor and critic, through all steps of a window; in SAC the critics alone."""
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **RECURRENT)
@@ -175,6 +176,7 @@ def rest_of(windows, hidden):
 
 
 @pytest.mark.parametrize("way", slow_but(WAYS, "recurrent"))
+@pytest.mark.slow
 def test_after_burn_in_steps_are_learned_from_with_the_memory_of_present_parameters(way):
     """Loss and gradient are those of the same steps without burn-in, if they begin with that memory."""
     agent, plain, windows = burning(way)

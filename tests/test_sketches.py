@@ -178,6 +178,7 @@ def test_the_curriculum_knows_the_lengths_of_sketches():
 SMALL = {"num_envs": 4, "unroll": 8, "minibatches": 2, "epochs": 1, "chunk_steps": 8}
 
 
+@pytest.mark.slow
 def test_tasks_that_do_not_take_part_yet_teach_nothing():
     """Beside "l", "rlr" is too long: its critic stays bit for bit, and so does the sub-policy of "right"."""
     env = dataclasses.replace(ENV, vary={"goal": "l,rlr"}, split="none")

@@ -250,6 +250,7 @@ def play(curriculum, chunks=3, reset_free=True):
     return goals, np.stack([worlds.state.gripper[:, 0] for worlds in seen])
 
 
+@pytest.mark.slow
 def test_worlds_play_on_forward_and_backward():
     """The goal changes where an episode's time is up, and the gripper is where it was."""
     goals, gripper = play("forward-backward")

@@ -47,6 +47,7 @@ def begun(knowing):
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (WINDOWS, *x.shape)), knowing.begin(OBS, ACTION))
 
 
+@pytest.mark.slow
 def test_one_pass_over_a_window_is_its_steps_one_by_one():
     """Before and after every step, through ends of trials and cuts, from a memory that is empty, half full and full."""
     params, state, filled = params_of(KNOWING), begun(KNOWING), set()
