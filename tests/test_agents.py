@@ -162,6 +162,7 @@ MIXED = ("care", "moe", "hip-bmdp")
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in MIXED else pytest.mark.nightly) for x in OFF_POLICY])
+@pytest.mark.slow
 def test_a_world_among_many_is_that_world_alone(name):
     """Seeds x tasks x environments as an evaluation has them, on whatever device tests run: no row is another's."""
     agent, shape = tiny(name), (10, 8, 5)

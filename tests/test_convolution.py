@@ -64,6 +64,7 @@ def of_many(network, pictures):
 
 
 @pytest.mark.parametrize("of", [of_seeds, of_tasks, of_mean, of_gradients, of_many])
+@pytest.mark.slow
 def test_maps_and_gradients_are_those_of_jax(of):
     pictures = normal(2, 3, 2, 12, 12, 3)
     jax.tree.map(

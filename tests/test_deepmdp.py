@@ -280,6 +280,7 @@ def reached(slopes):
     return {name for name, part in parts if any(np.any(x) for x in jax.tree.leaves(part))}
 
 
+@pytest.mark.slow
 def test_each_loss_reaches_its_own_parameters_alone():
     """Encoder and theta learn from critics and models, theta alone from its loss, and the guess by itself."""
     agent = make("hip-bmdp", transition="probabilistic", **INFERRED)

@@ -313,6 +313,7 @@ def test_what_cannot_teach_is_refused(goals, given, said):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_policies_of_other_shapes_do_not_teach():
     """Nor those that adapt first, or with other networks than each other, or of trials of other lengths."""
     env, wide, run = aim("-1,1"), taught_in(mtjax.make("aim-wide")), taught_in(aim("-1,1"))

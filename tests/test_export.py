@@ -154,6 +154,7 @@ def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
 
 
 @pytest.mark.parametrize("name", ["sac-conditioned", "multi-head"])
+@pytest.mark.slow
 def test_a_file_is_called_as_the_policy_is(name, tmp_path):
     """Alone and in batches, by the same names of parameters, also where the nearest task lends its head."""
     policy = policy_of(tiny(name))

@@ -100,6 +100,7 @@ def file(tmp_path_factory):
     return mtjax.export(policy, tmp_path_factory.mktemp("exported") / "policy.npz")
 
 
+@pytest.mark.slow
 def test_a_file_tells_how_to_make_what_it_sees(file):
     """Shapes, the order of pictures and channels, and how an episode begins."""
     policy = standalone.load(file)

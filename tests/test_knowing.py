@@ -50,6 +50,7 @@ def test_an_embedding_is_seen_by_all_networks(agent):
 
 
 @pytest.mark.parametrize("conditioning", ["embedding", "inferred"])
+@pytest.mark.slow
 def test_the_critics_loss_trains_it_and_the_actors_does_not(conditioning):
     """In agents with a replay; its slow copy is the targets'."""
     more = {"inferred_from": 2} if conditioning == "inferred" else {}

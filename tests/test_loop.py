@@ -395,6 +395,7 @@ class Sees(Recorder):
         return task.context + 100 * task.id
 
 
+@pytest.mark.slow
 def test_episodes_draw_their_tasks_where_those_are_continuous():
     """Each episode has one draw of its own task from start to end, stored and acted on; the next has another."""
     state, _ = train(Drifting(), Sees(), SETTINGS, seeds=(0, 1), chunks=3)

@@ -63,6 +63,7 @@ def pulls(made, state):
 
 @pytest.mark.parametrize("first_order", [False, True])
 @pytest.mark.parametrize("x", [-0.7, 0.0, 1.2])
+@pytest.mark.slow
 def test_steps_are_those_of_the_closed_form(x, first_order):
     """Log odds are the difference of two biases, which move by the same: twice the rate. Hidden units are 0."""
     made, state = armed(inner_rate=1.5, first_order=first_order)

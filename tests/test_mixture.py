@@ -795,6 +795,7 @@ def test_families_of_several_choices_mix_where_their_sizes_are_equal():
     assert seen.reward.shape == (1, *keys.shape) and np.all(np.asarray(seen.reward) == 1)
 
 
+@pytest.mark.slow
 def test_families_of_discrete_actions_mix():
     """Policies choose among the actions of each family alone, and every family steps as it does alone."""
     env = mixture([make("bandit", num_tasks=2, num_arms=2), make("tabular-mdp", num_tasks=2)])

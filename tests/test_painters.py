@@ -272,6 +272,7 @@ def test_normals_stand_on_every_shape():
         assert np.median(np.sum(normal * slope, axis=1)) > 0.995
 
 
+@pytest.mark.slow
 def test_one_world_among_many_looks_as_it_does_alone():
     """More worlds than the caster draws at once, of which the last chunk is not full."""
     env = family("finger-spin")

@@ -198,6 +198,7 @@ def test_a_copy_has_numbers_of_its_own(chosen):
         assert np.isclose(after[name][2] / before[name][1], factors).any()
 
 
+@pytest.mark.slow
 def test_choices_compile_one_program(chosen):
     """Whoever is copied."""
     assert chosen[2].sources.tolist() != chosen[1].sources.tolist()

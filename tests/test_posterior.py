@@ -401,6 +401,7 @@ def test_the_policy_that_learns_is_the_one_that_played(way):
     assert history[0]["ratio"].max() < 1e-4 and np.all(history[0]["bad_step"] == -1)
 
 
+@pytest.mark.slow
 def test_memory_lives_through_a_trial_and_is_new_after_it():
     """PEARL's sums, as a replay stores them: 0 where a trial begins, else what the step before has added to them."""
     agent = tiny("sac", recurrent_steps=4, **posterior("pearl"))
@@ -425,7 +426,10 @@ def test_memory_lives_through_a_trial_and_is_new_after_it():
 
 @pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
-@pytest.mark.parametrize(("way", "num_envs", "rollouts"), [("varibad", 256, 300), ("pearl", 1024, 240)])
+@pytest.mark.parametrize(
+    ("way", "num_envs", "rollouts"),
+    [("varibad", 256, 300), pytest.param("pearl", 1024, 240, marks=pytest.mark.nightly)],
+)
 def test_a_belief_explores_as_well_as_can_be(way, num_envs, rollouts):
     """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67.
 

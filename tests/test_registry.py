@@ -59,7 +59,12 @@ def play(env, tasks, keys):
     return start, *jax.lax.scan(step, start.state, jnp.arange(STEPS))
 
 
-@pytest.mark.parametrize("name", slow_but(ENVS, *QUICK[::4]))
+SAME_BODIES = {"brax-humanoidstandup", "brax-halfcheetah-vary-speed"}  # as others', and half a minute each
+AT_THE_ENDS = [pytest.param(x, marks=pytest.mark.nightly) for x in ENVS if x in SAME_BODIES]
+AT_THE_ENDS += slow_but([name for name in ENVS if name not in SAME_BODIES], *QUICK[::4])
+
+
+@pytest.mark.parametrize("name", AT_THE_ENDS)
 def test_family_steps_at_the_ends_of_its_range(name):
     """200 random steps: sizes as declared, all finite until an episode ends, starts that differ, and the same again."""
     env = mtjax.make(name)

@@ -59,6 +59,7 @@ def test_redo_renews_idle_units_and_changes_no_output():
     assert count(before) == count(after) == 1
 
 
+@pytest.mark.slow
 def test_redo_waits_for_its_turn():
     agent, state, batch = made("redo", redo_every=10, dormant_threshold=1e9)
     renew = jax.jit(lambda number: unit_resets.renew(agent, state, batch, jax.random.key(2), number))

@@ -110,6 +110,7 @@ def episodes_of(rows):
     return np.cumsum(rows.ended, axis=3) - rows.ended
 
 
+@pytest.mark.slow
 def test_a_trial_closes_with_every_third_episode(drifting):
     """In every world, whatever the lengths of its episodes."""
     rows, state, _ = drifting
@@ -324,6 +325,7 @@ class Blind(Stub):
     """Does nothing."""
 
 
+@pytest.mark.slow
 def test_the_task_of_an_evaluated_trial_stays_and_each_episode_begins_elsewhere():
     """A walk's return tells its task and its start."""
     env = Drifting()
