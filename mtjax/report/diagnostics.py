@@ -116,7 +116,8 @@ def diagnose(policy: Policy, data: Any, batch_size: int) -> Diagnostics:
         activity = _sample_activity(policy.env, agent, state, of_seed, tasks, sample_key)
         found.append(_summarise(agent, state, gradients, activity))
     networks, td_error = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
-    networks = {name: x._replace(width=int(x.width)) for name, x in networks.items()}
+    order = [name for name in ("critic", "actor") if name in networks]  # as a map over a tree sorts them
+    networks = {name: networks[name]._replace(width=int(networks[name].width)) for name in order}
     return Diagnostics(networks, td_error, batch_size, len(found))
 
 
