@@ -528,6 +528,7 @@ def test_films_of_slow_worlds_are_quick():
     assert per_second == pytest.approx({"link": 10, "racing": 20, "sailing": 20, "tabletop": 20, "trading": 10})
 
 
+@pytest.mark.slow
 def test_a_sale_is_filmed_though_its_state_has_a_key():
     """As the command films it: ten of the fifty steps for each second."""
     env, _ = alone("trading")

@@ -331,6 +331,7 @@ def test_the_actor_does_not_move_the_critics_parameters():
         ],
     ),
 )
+@pytest.mark.slow
 def test_everything_that_should_learn_does(name, settings):
     """After ten updates no leaf is where it began, nor any task's part of it, and shapes are as they were."""
     agent = make(name, **settings)

@@ -129,6 +129,7 @@ TRAINED = ("actor", "critic", "representation", "knowing")
 
 
 @EVERY_AGENT
+@pytest.mark.slow
 def test_everything_that_should_learn_does(case):
     """After ten updates no leaf is where it began: no task's, no critic's and no expert's part of it."""
     before, update = start(case)

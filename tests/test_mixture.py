@@ -223,6 +223,7 @@ def test_names_of_families_and_tasks():
     assert "2 training tasks" in mixture(["cartpole-swingup", "walker-walk"]).summary
 
 
+@pytest.mark.slow
 def test_a_summary_says_what_every_episode_draws():
     """A range without a number of steps is of one task, and not of its two ends."""
     drawn = make("finger-spin", vary={"size": "1:1.2", "mass": "1,2"})
@@ -289,6 +290,7 @@ def steps_of(env, tasks, keys, actions):
 
 
 @pytest.mark.parametrize("split", slow_but(["train", "all"], "all"))
+@pytest.mark.slow
 def test_every_family_steps_as_it_does_alone(split):
     scored = [make(name, num_tasks=2, scores=True) for name in ("tabular-mdp", "two-goal-maze-seen")]
     env = mixture([make("control-cartpole", num_tasks=2), *scored])

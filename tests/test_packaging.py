@@ -84,6 +84,7 @@ print(mtjax.__file__, policy(policy.env.reset(task, jax.random.key(0)).obs, task
     assert run(sys.executable, "-c", acts).split() == [str(tmp_path / "lib" / "mtjax" / "__init__.py"), "(2,)"]
 
 
+@pytest.mark.slow
 def test_wheel_says_its_version_and_commands(built):
     """The version is that of the package, which is read and not written twice."""
     _, wheel, metadata = built

@@ -20,6 +20,7 @@ FAMILIES = (
 
 
 @pytest.mark.parametrize("name", one_in(2, FAMILIES))
+@pytest.mark.slow
 def test_bodies_are_where_mujoco_has_them(name):
     """First and last task in ten random states each: angles, frames, centres of mass and their velocities."""
     env = mtjax.make(name, engine="c")

@@ -26,6 +26,7 @@ PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
 
 
 @pytest.mark.parametrize("name", slow_but([x for x in agents.AGENTS if family_for(x) == "finger-spin"], "care"))
+@pytest.mark.slow
 def test_an_action_depends_on_what_is_kept_alone(name):
     """Whatever the other arrays of the state hold."""
     policy = policy_of(tiny(name))

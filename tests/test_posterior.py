@@ -196,6 +196,7 @@ def test_varibad_learns_how_often_the_arms_of_a_bandit_pay():
 
 
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.slow
 def test_beliefs_over_a_window_are_those_of_steps_one_by_one(way):
     """Anew after the end of a trial, and not of an episode, at which nothing is known of what follows.
 

@@ -73,6 +73,7 @@ def reset(cls, ended, seed=1, shift="1,2,3", **settings):
 
 @pytest.mark.parametrize("share", slow_but([0, 0.01, 0.1, 1], 0.1))
 @pytest.mark.parametrize("shift", ["1,2,3", "1:2"])
+@pytest.mark.slow
 def test_some_worlds_are_reset_to_the_states_that_all_would_have(share, shift):
     """Bit for bit, also where episodes draw their tasks; and no more worlds than had to be."""
     shape = (SHAPE[0], 3 if "," in shift else 1, SHAPE[2])

@@ -222,6 +222,7 @@ def test_profile_of_a_run_of_one_chunk_is_of_that(play, tmp_path):
     assert list(tmp_path.glob("profile/plugins/profile/*/*.trace.json.gz"))
 
 
+@pytest.mark.slow
 def test_the_clock_counts_down_to_the_end(play, tmp_path, monkeypatch):
     """Of a run and of the rest of one: its chunks, and its evaluations, the last of which is at no multiple.
 

@@ -338,6 +338,7 @@ def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("how", ["closed", "interrupted"])
+@pytest.mark.slow
 def test_a_page_ends_with_its_input_or_by_ctrl_c(free, how):
     """A run's page has a pipe as its input, which is closed when the run ends or is killed."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background, and so in what it starts
