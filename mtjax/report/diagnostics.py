@@ -134,15 +134,10 @@ def _summarise(agent: Any, state: Any, gradients: dict, activity: Mapping) -> tu
 def _average_gradients(env: Env, agent: Any, state: Any, data: Any, tasks: Task, key: Key, batch_size: int) -> dict:
     def draw(key: Key) -> dict:
         batch_key, loss_key = jax.random.split(key)
-        window = _draw(env, agent, data, batch_key, batch_size)
+        window = agent.experience.draw(env.spec, agent, data, batch_key, batch_size)
         return compare_gradients(agent, state, window, tasks, loss_key)
 
     return jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.lax.map(draw, jax.random.split(key, DRAWS)))
-
-
-def _draw(env: Env, agent: Any, data: Any, key: Key, count: int) -> Transition:
-    """Draw windows (T, B, L, ...) of ``count`` transitions of every task together."""
-    return agent.experience.draw(env.spec, agent, data, key, max(count // max(agent.unroll, 1), 1))
 
 
 def compare_gradients(agent: Any, state: Any, window: Transition, tasks: Task, key: Key) -> dict[str, Any]:
@@ -180,7 +175,7 @@ class Activity(NamedTuple):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _sample_activity(env: Env, agent: Any, state: Any, data: Any, tasks: Task, key: Key) -> dict[str, Activity]:
-    return activity(agent, state, _draw(env, agent, data, key, SAMPLE), tasks)
+    return activity(agent, state, agent.experience.draw(env.spec, agent, data, key, SAMPLE), tasks)
 
 
 def activity(agent: Any, state: Any, window: Transition, tasks: Task) -> dict[str, Activity]:

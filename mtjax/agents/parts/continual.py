@@ -243,7 +243,7 @@ class Clone(Nothing):
     Where a task ends, steps of its replay and the outputs y of the actor there are stored, with the output layer that
     it has for itself, if any. To the actor's loss is added
         coefficient mean KL(pi(y) | pi(y')),  y' = outputs now
-    over a batch of stored steps of other tasks, all of which are drawn alike. Only what tasks share learns by it.
+    over a batch of stored steps of other tasks. Each of these tasks is as likely. Only what tasks share learns by it.
     """
 
     keeps: ClassVar[bool] = True
