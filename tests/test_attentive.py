@@ -149,7 +149,7 @@ def test_two_sub_networks_learn_swapped_actions_and_one_learns_half(grids):
     assert np.all(two == 1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_twenty_tasks_learn_as_much_with_five_sub_networks_as_with_networks_of_their_own(grids, tmp_path):
     env, agent = grids.Grid(), grids.shared(5)
     own = grids.learned(env, grids.made(heads="disjoint", conditioning="none"), 100)[1]

@@ -53,6 +53,7 @@ VARIED = {
 DOMAINS, SLOW = list(VARIED), pytest.mark.slow
 # MJX takes ten seconds to compile a domain with contact.
 QUICK_DOMAINS = ("pendulum-swingup",)
+LONG = ("humanoid-walk", "swimmer-swimmer6", "finger-turn-easy")  # to compile by MJX, or as another's
 ALIKE = [name for name in DOMAINS if name != "dog-walk"]  # MJX and Warp step another dog: tests/test_bodies.py
 HEAVY = ("dog-walk", "humanoid-walk")  # whose play takes seconds
 # Bounds on each world's largest error in velocity, by quantile, relative to the domain's fastest velocity. MJX and Warp
@@ -170,7 +171,13 @@ def compiled_step(name, env, play):
     return jax.jit(jax.vmap(env.simulator.step)).lower(*play[:3]).compile(compiler_options=some)
 
 
-@pytest.mark.parametrize("name", slow_but(ALIKE, *QUICK_DOMAINS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        *slow_but([name for name in ALIKE if name not in LONG], *QUICK_DOMAINS),
+        *(pytest.param(name, marks=pytest.mark.nightly) for name in LONG),
+    ],
+)
 def test_mjx_steps_as_c_does(name):
     """With solver iterations to spare, in all but a stated share of the states of play; and rewards are those of C."""
     env, play = family(name, engine="mjx", solver_iterations=10), played(name)

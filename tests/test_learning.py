@@ -22,7 +22,7 @@ QUICK = {
     "normalize_observations": True,
 }
 LONGER = {"distral": 2500}  # whose tasks share no experience
-USUAL = ("sac-conditioned", "multi-head", "soft-modularization", "hip-bmdp")
+USUAL = ("sac-conditioned", "multi-head")
 TOLD = [name for name in OFF_POLICY if name != "sac"]
 EVERY = [
     *slow_but(USUAL),

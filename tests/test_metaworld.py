@@ -329,7 +329,7 @@ def test_films_show_meshes_and_things_where_the_goal_has_them():
 
 @needs("metaworld")
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["push", "stick-push"])  # the second one feels forces
+@pytest.mark.parametrize("name", [pytest.param("push", marks=pytest.mark.nightly), "stick-push"])  # which feels forces
 @needs("warp")
 def test_physics_are_set_on_warp_as_on_c(name):
     found = []

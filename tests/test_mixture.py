@@ -755,7 +755,11 @@ def test_families_that_look_otherwise_do_not_mix():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [("drq", {}), ("drq", {"representation": "asymmetric"}), ("ppo", {"representation": "encoded"})],
+    [
+        ("drq", {}),
+        pytest.param("drq", {"representation": "asymmetric"}, marks=pytest.mark.nightly),
+        ("ppo", {"representation": "encoded"}),
+    ],
 )
 def test_agents_learn_a_mixture_of_pictures(monkeypatch, name, settings):
     """Every task's own best action, which its number in the context tells."""

@@ -1,6 +1,7 @@
 """The notebooks run from top to bottom, and learn what they say."""
 
 import ast
+import os
 from pathlib import Path
 
 import pytest
@@ -25,12 +26,13 @@ def test_notebook_shows_its_results(path):
     assert path.stat().st_size < LARGEST
 
 
-@pytest.mark.usefixtures("optimised")
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 @pytest.mark.filterwarnings("ignore")  # the kernel's own machinery, in this process, is not ours
-def test_notebook_runs(path):
+def test_notebook_runs(path, monkeypatch):
     """Every cell executes as it stands, the check of the conclusion too."""
+    flags = os.environ.get("XLA_FLAGS", "")  # a kernel compiles much, but what it learns takes optimised programs
+    monkeypatch.setenv("XLA_FLAGS", flags.replace("optimization_level=0", "optimization_level=1"))
     notebook = require("nbformat").read(path, as_version=4)
     require("nbclient").NotebookClient(
         notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}

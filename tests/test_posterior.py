@@ -426,11 +426,8 @@ def test_memory_lives_through_a_trial_and_is_new_after_it():
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("way", "num_envs", "rollouts"),
-    [("varibad", 256, 300), pytest.param("pearl", 1024, 240, marks=pytest.mark.nightly)],
-)
+@pytest.mark.nightly  # a minute and more each
+@pytest.mark.parametrize(("way", "num_envs", "rollouts"), [("varibad", 256, 300), ("pearl", 1024, 240)])
 def test_a_belief_explores_as_well_as_can_be(way, num_envs, rollouts):
     """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67.
 

@@ -59,7 +59,7 @@ def play(env, tasks, keys):
     return start, *jax.lax.scan(step, start.state, jnp.arange(STEPS))
 
 
-SAME_BODIES = {"brax-humanoidstandup", "brax-halfcheetah-vary-speed"}  # as others', and half a minute each
+SAME_BODIES = {"brax-humanoidstandup", "brax-halfcheetah-vary-speed", "brax-ant-vary-direction"}  # as others'
 AT_THE_ENDS = [pytest.param(x, marks=pytest.mark.nightly) for x in ENVS if x in SAME_BODIES]
 AT_THE_ENDS += slow_but([name for name in ENVS if name not in SAME_BODIES], *QUICK[::4])
 

@@ -287,7 +287,7 @@ def results(directory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env", ["control-cartpole", "finger-spin-vary-size"])
+@pytest.mark.parametrize("env", ["control-cartpole", pytest.param("finger-spin-vary-size", marks=pytest.mark.nightly)])
 def test_a_second_run_traces_nothing(tmp_path, env):
     """Training and evaluation, in JAX and by MuJoCo C; and what they write is what a run without the cache writes."""
     runs = [tmp_path / name for name in ("without", "first", "second")]

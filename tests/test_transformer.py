@@ -186,7 +186,7 @@ def test_the_policy_that_learns_is_the_one_that_played(way):
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.slow
+@pytest.mark.nightly  # it takes a minute
 def test_it_explores_as_well_as_can_be():
     """Ten pulls of two arms that every trial draws: within 3% of the best strategy, which earns 6.02; told 6.67.
 
