@@ -84,7 +84,8 @@ def note_origin(arguments: argparse.Namespace, out: Path) -> None:
     file, made = out / "origin.json", json.dumps(record(arguments, {}), default=str)
     known = file.read_text().splitlines() if file.exists() else []
     if made not in known:
-        file.write_text("\n".join([*known, made]) + "\n")
+        with file.open("a") as lines:  # in one write, as other processes may add theirs now
+            lines.write(made + "\n")
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
