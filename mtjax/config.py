@@ -19,6 +19,7 @@ from mtjax.agents import BaseAgent, agent, preset_of, settings, tuned_as
 from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.hyperparameters import kinds_of, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
+from mtjax.agents.rates import planned
 from mtjax.agents.swept import agents_at
 from mtjax.agents.teacher import Teacher
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_text
@@ -197,6 +198,11 @@ class RunConfig:
         """Return the steps that every environment plays, in whole chunks."""
         return math.ceil(self.plan.steps / self.steps_per_chunk) * self.played.chunk_steps
 
+    @cached_property
+    def trained(self) -> BaseAgent:
+        """Return the agent as it is trained, with its schedule's length."""
+        return planned(self.learner, self.length)
+
     @property
     def longest(self) -> int:
         """Return the most iterations that a chunk has, however many steps the run takes."""
@@ -290,12 +296,12 @@ def with_preset(
         chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen
     chosen = for_tasks(chosen, made.train_count, device)
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
-    planned, played = preset.get("plan", {}) | take(Plan), take(Settings)
+    plan, played = preset.get("plan", {}) | take(Plan), take(Settings)
     return RunConfig(
         env=env_name,
         agent=agent_name,
         preset=preset_name,  # type: ignore
-        plan=Plan(**planned),
+        plan=Plan(**plan),
         training=Settings(**played),
         family=made,
         learner=agent(agent_name, **{**chosen, **agent_settings}),

@@ -510,6 +510,23 @@ def test_engines_step_as_mujoco_does(name, engine):
     assert np.quantile(np.abs(new.qpos - new_qpos).max(axis=1), 0.9) < 1e-3
 
 
+@needs("gymnasium")
+def test_worlds_outside_of_jax_take_each_step_once(count=64, steps=20):
+    """As on the CPU, where a scan keeps their rewards and observations; a step that is made twice is refused."""
+    env = mtjax.hosted("CartPole-v1")
+
+    def play(tasks, keys):
+        step = lambda states, _: (
+            (after := env.step_worlds(tasks, states, jnp.zeros((1, 1, count), jnp.int32))).state,
+            (after.reward, after.terminated, after.obs),
+        )
+        return jax.lax.scan(step, env.reset_worlds(tasks, keys).state, length=steps)[1]
+
+    with on("cpu"):
+        keys = jax.random.split(jax.random.key(0), (1, 1, count))
+    jax.tree.map(np.testing.assert_array_equal, *both(play, env.tasks(), keys))
+
+
 @pytest.mark.parametrize("name", ["finger-spin-vary-size", "walker-walk-vary-friction"])
 def test_steps_on_the_host_are_moved_while_warp_records(name):
     """Warp records CUDA graphs when a program first runs, as the evaluation does beside an exchange of many steps."""

@@ -12,7 +12,6 @@ import jax
 import numpy as np
 
 from mtjax.agents import settings as settings_of
-from mtjax.agents.rates import planned
 from mtjax.config import RunConfig
 from mtjax.learning.evaluation import Evaluations
 from mtjax.learning.loop import TrainState
@@ -99,7 +98,7 @@ class Journal:
             sinks: list[Sink] = []
             if self.records.writes:
                 assert self.hooks.directory is not None
-                config, agent = self.config, settings_of(planned(self.config.learner, self.config.length))
+                config, agent = self.config, settings_of(self.config.trained)
                 told = {**dataclasses.asdict(config.plan), **dataclasses.asdict(config.played), **agent}
                 sinks = open_sinks(self.hooks.directory, config.tensorboard, config.wandb, steps, told)
             for sink in sinks:

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mtjax.agents.rates import planned
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
 from mtjax.envs.engines import host
@@ -75,11 +74,6 @@ class _Run:
     hooks: Hooks = NO_HOOKS
 
     @cached_property
-    def agent(self) -> Any:
-        """Return the agent as it is trained: with its schedule's length."""
-        return planned(self.config.learner, self.config.length)
-
-    @cached_property
     def entries(self) -> Entries:
         return Entries(self.config)
 
@@ -93,7 +87,9 @@ class _Run:
 
     @cached_property
     def exchange(self) -> Exchange:
-        return Exchange(self.config.family, self.agent, self.config.played, self.config.mesh, self.hooks.directory)
+        return Exchange(
+            self.config.family, self.config.trained, self.config.played, self.config.mesh, self.hooks.directory
+        )
 
     def train(self, started: float) -> Result:
         """Prepare the run, and play its chunks; ``started`` is the clock when the user began to wait."""
@@ -107,7 +103,7 @@ class _Run:
                 self.journal.introduce()
             programs, state = self.prepare(resumed)
             if self.hooks.start is not None and not resumed:
-                begun = adopted(self.config, self.hooks, self.agent, hosts.gather(state.agent))
+                begun = adopted(self.config, self.hooks, self.config.trained, hosts.gather(state.agent))
                 state = state._replace(agent=meshes.shard_by_seed(self.config.mesh, begun))
             held.callback(self.exchange.close)
             self.exchange.begin(state)
@@ -118,7 +114,7 @@ class _Run:
 
     def prepare(self, resume: bool) -> tuple[Programs, TrainState]:
         """Compile all programs in parallel, and make or restore the state. Evaluation may be ready later."""
-        env, agent, settings = self.config.family, self.agent, self.config.played
+        env, agent, settings = self.config.family, self.config.trained, self.config.played
         lazy = jit_programs(self.config.mesh, agent)
         tasks, everything = (meshes.replicate(self.config.mesh, env.tasks(split)) for split in ("train", "all"))
         (seeds, numbers), pool = meshes.shard_by_seed(self.config.mesh, self.entries.axis), ThreadPoolExecutor(3)
@@ -148,15 +144,15 @@ class _Run:
 
     def _describe(self, shapes: TrainState) -> None:
         spec, settings = self.config.family.spec, self.config.played
-        needs = memory.Needs.of(shapes, spec, self.agent, settings)
+        needs = memory.Needs.of(shapes, spec, self.config.trained, settings)
         memory.require_room(needs, spec)
-        kind = self.agent.experience.describe(spec, settings.num_envs)
+        kind = self.config.trained.experience.describe(spec, settings.num_envs)
         for line in memory.tell(shapes.data, needs, kind, len(self.entries.seeds)):
             self.journal.console.say(line)
         if line := meshes.describe(self.config.mesh, len(self.entries.seeds), settings.num_envs):
             self.journal.console.say(line)
         if self.hooks.directory is not None:
-            flags = [*self.agent.experience.storage.flags, *["host-replay-size"] * bool(needs.host)]
+            flags = [*self.config.trained.experience.storage.flags, *["host-replay-size"] * bool(needs.host)]
             checkpoint.require_space(self.hooks.directory, shapes, needs.host, flags)
 
     def _begin(self, programs: Programs, state: TrainState, steps: int) -> _Progress:

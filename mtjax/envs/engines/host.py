@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import io_callback
 
@@ -135,12 +136,22 @@ def call(name: str, width: int, values: jax.Array) -> jax.Array:
 def call_once(name: str, shapes: Sequence[jax.ShapeDtypeStruct], *values: jax.Array) -> Sequence[jax.Array]:
     """Call a registered function that changes what the host holds; return what it fills in. It cannot be mapped.
 
-    Calls come in the order in which they need each other's results. Programs of any device can make them; those of a
-    GPU are then not kept for other processes.
+    The first value, and the first thing that it fills in, are counts. Calls come in the order in which they need each
+    other's results. Programs of any device can make them; those of a GPU are then not kept for other processes.
     """
     if jax.default_backend() == "cpu":
         return jax.ffi.ffi_call(name, shapes, has_side_effect=True)(*values)
-    return io_callback(partial(_fill, name, shapes), shapes, *values)
+    return _apart(io_callback(partial(_fill, name, shapes), shapes, *_apart(values)))
+
+
+def _apart(values: Sequence[jax.Array]) -> Sequence[jax.Array]:
+    """Keep what a call takes or gives apart from the stacks of a scan.
+
+    Where a call reads from a stack or writes to one, XLA for GPUs makes a copy of it that does so in place, and then
+    runs both: a world would take two steps. A choice that XLA cannot foresee is between them: no count is negative.
+    """
+    never = values[0].ravel()[0] < 0
+    return [jnp.where(never, jnp.zeros_like(x), x) for x in values]
 
 
 def _fill(name: str, shapes: Sequence[jax.ShapeDtypeStruct], *values: Any) -> list[np.ndarray]:
