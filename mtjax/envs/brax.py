@@ -66,7 +66,21 @@ class Brax(Family):
 
     Observation (O,), after the step: Brax's own (brax.envs).
     Action (A,): in [-1, 1], Brax's own.
-    Reward: Brax's own, after the step.
+    Reward: Brax's own. With the action a, the velocity v [m/s] of the torso along x over the step (in humanoid that of
+        the centre of mass), and places [m] after the step (in pusher those before it),
+            r = v + 1 - 0.5 |a|^2  (ant)
+            r = x  (fast: how far along x it is)
+            r = v - 0.1 |a|^2  (halfcheetah)
+            r = v + 1 - 0.001 |a|^2  (hopper, walker2d)
+            r = 1.25 v + 5 - 0.016 |a|^2  (humanoid)
+            r = z / 0.015 + 1 - 0.0016 |a|^2  (humanoidstandup: z is the height of the torso)
+            r = 10 u - 0.01 x^2 - (z - 2)^2 - 0.001 omega_1^2 - 0.005 omega_2^2  (inverted_double_pendulum)
+            u = 1 if z > 1, else 0  (its upper pole's end is at x and z, its joints turn at omega)
+            r = 1  (inverted_pendulum)
+            r = -|object - goal| - 0.5 |object - tip| - 0.4 |a|^2  (pusher)
+            r = -|tip - target| - |a|^2  (reacher)
+        Where Brax charges for the motors' commands, which are 0.4 a in both humanoids and 2 a in pusher, the weights
+        here are those of a.
     Start: Brax's own, drawn anew for every episode.
     Episode: Brax's own termination, such as a fall of the ant, ends an episode for good; at 1000 steps, Brax's episode
         length, it is cut off.
@@ -204,9 +218,11 @@ class Brax(Family):
 class BraxAntDirection(Brax):
     """Brax's ant must run in a given direction.
 
-    As Brax's ant in everything but the reward: its velocity along the direction [m/s] + 1 - 0.5 |action|^2. Survival
-        and control are those of Brax's ant, which direction 0 gives back. An episode ends where the torso is lower
-        than 0.2 m or higher than 1 m.
+    As Brax's ant in everything but the reward. An episode ends where the torso is lower than 0.2 m or higher than 1 m.
+
+    Reward: with the torso's velocity v over the step [m/s], the direction theta and the action a,
+            r = v_x cos theta + v_y sin theta + 1 - 0.5 |a|^2
+        Survival and control are those of Brax's ant, which direction 0 gives back.
 
     Parameters that can vary beside those of Brax:
         direction: angle [rad] of the direction to run in, from the x axis, in (-pi, pi].
@@ -232,8 +248,11 @@ class BraxAntDirection(Brax):
 class BraxHalfcheetahSpeed(Brax):
     """Brax's half-cheetah must run at a given speed.
 
-    As Brax's halfcheetah in everything but the reward: -|velocity - speed| [m/s] - 0.05 |action|^2, the one of MAML
-        (Finn et al. 2017) and PEARL (Rakelly et al. 2019). Brax's own half-cheetah pays 0.1 |action|^2.
+    As Brax's halfcheetah in everything but the reward.
+
+    Reward: with the torso's velocity v along x over the step [m/s] and the action a,
+            r = -|v - speed| - 0.05 |a|^2
+        as in MAML (Finn et al. 2017) and PEARL (Rakelly et al. 2019). Brax's own half-cheetah pays 0.1 |a|^2.
 
     Parameters that can vary beside those of Brax:
         speed: velocity of the torso to run at [m/s], forwards.

@@ -25,8 +25,8 @@ class AcrobotSwingup(Domain):
     Action (1,): torque of the elbow in [-1, 1]; a gear of 2 N m.
     Reward: with the distance d from the tip to the target,
             r = 0.1^(x^2),  x = max(d - 0.2, 0)
-        which is 1 within 0.2 m, and falls as a Gaussian to 0.1 at 1 m from that; if ``sparse``, 0 outside. Returns lie
-        in [0, 1000].
+            r = 1 if d <= 0.2, else 0  (sparse)
+        The first is 1 within 0.2 m, and falls as a Gaussian to 0.1 at 1 m from that. Returns lie in [0, 1000].
     Start: shoulder and elbow uniform in [-pi, pi], at rest.
     Episode: 1000 steps of 0.01 s (one Runge-Kutta step of fourth order); it never terminates.
 

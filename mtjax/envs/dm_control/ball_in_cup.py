@@ -32,8 +32,10 @@ class BallInCup(Domain):
     Observation (8,), all after the step: x and z of the cup and of the ball, relative to where they hang in the model
         [m]; their velocities in the same order [m/s].
     Action (2,): forces on the cup along x and z in [-1, 1]; gears of 5 N.
-    Reward: 1 while the ball is wholly inside the box of 0.1 m by 0.1 m that the cup encloses, else 0; returns lie in
-        [0, 1000].
+    Reward: with the ways x and z from the middle of the box that the cup encloses to the ball's centre, and the ball's
+        radius R of 0.025 m,
+            r = 1 if |x| < 0.05 - R and |z| < 0.05 - R, else 0
+        The ball is then wholly inside the box of 0.1 m by 0.1 m. Returns lie in [0, 1000].
     Start: the cup at rest in its place, the ball at rest, with x uniform in [-0.2, 0.2] m and z in [0.4, 0.7] m above
         the ground, drawn again until nothing touches.
     Episode: 1000 steps of 0.02 s (ten substeps of 0.002 s); it never terminates.
@@ -110,10 +112,12 @@ class BallInCup(Domain):
 class BallInCupSpin(BallInCup):
     """Spin: swing the ball round and round the cup at 3 m/s or faster.
 
-    As BallInCup, but for the reward, the product of two factors in [0, 1]: one is 1 where the ball goes round the cup's
-    bottom from x towards z at ``speed`` or faster as the cup sees it, and falls linearly to 0 at rest; the other is 1
-    where the ball is 5/6 of the string's length or more from there, and falls linearly to 0 at 2/3. Not a task of
-    dm_control: it has the same model, starts and episodes.
+    As BallInCup, but for the reward. Not a task of dm_control: it has the same model, starts and episodes.
+
+    Reward: with the velocity v at which the ball goes round the cup's bottom from x towards z as the cup sees it, its
+        distance d from there, and the string's length L,
+            r = clip(v / speed, 0, 1) clip(6 d / L - 4, 0, 1)
+        The second factor is 1 from 5/6 of the string's length on, and 0 up to 2/3. Returns lie in [0, 1000].
 
     Further parameter: speed [m/s].
     """

@@ -37,9 +37,9 @@ class CartpoleBalance(Domain):
     Action (1,): force on the cart in [-1, 1]; a gear of 10 N.
     Reward: with the pole's angle theta and velocity omega, and the cart's position x,
             r = (1 + cos theta) / 2 * (4 + q) / 5 * (1 + g_omega) / 2 * (1 + g_x) / 2
+            r = 1 if |x| <= 0.25 and cos theta >= 0.995, else 0  (sparse)
         where q falls quadratically from 1 without force to 0 at full force, and g_omega and g_x are Gaussians, 0.1 at 5
-        rad/s and at 2 m. If ``sparse``, 1 while the cart is within 0.25 m of the middle and the cosine
-        is at least 0.995, else 0. Returns lie in [0, 1000].
+        rad/s and at 2 m. Returns lie in [0, 1000].
     Start: cart uniform in [-0.1, 0.1] m, pole in [-0.034, 0.034] rad, both velocities normal with deviation 0.01.
     Episode: 1000 steps of 0.01 s (one Runge-Kutta step of fourth order); it never terminates.
 

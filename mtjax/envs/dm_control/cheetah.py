@@ -154,6 +154,10 @@ class CheetahRunBackward(CheetahRun):
     """Run backwards, the faster the better, up to 10 m/s.
 
     As CheetahRun, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+
+    Reward: with the forward velocity v of the centre of mass,
+            r = clip(-v / speed, 0, 1)
+        where ``speed`` is 10 m/s. Returns lie in [0, 1000].
     """
 
     heading: ClassVar[float] = -1.0
@@ -163,9 +167,12 @@ class CheetahRunBackward(CheetahRun):
 class CheetahJump(CheetahRun):
     """Jump: have the body high over the ground.
 
-    As CheetahRun, but for the reward: 1 where the whole body's centre of mass is ``height`` or more over the ground,
-    falling linearly to 0 at the 0.45 m of a cheetah that stands still. Not a task of dm_control: it has the same model,
-    starts and episodes.
+    As CheetahRun, but for the reward. Not a task of dm_control: it has the same model, starts and episodes.
+
+    Reward: with the height h of the whole body's centre of mass over the ground, which is 0.45 m in a cheetah that
+        stands still,
+            r = clip((h - 0.45) / (height - 0.45), 0, 1)
+        Returns lie in [0, 1000].
 
     Further parameter, in place of speed: height [m].
     """
@@ -183,10 +190,13 @@ class CheetahJump(CheetahRun):
 class CheetahSpeed(CheetahRun):
     """Speed: move forwards at the task's velocity, neither slower nor faster.
 
-    As CheetahRun, but for the reward: 1 where the forward velocity of the centre of mass is ``speed`` [m/s], falling
-    linearly to 0 at rest and at twice that velocity. Up to ``speed`` it is CheetahRun's own. MAML's velocity tasks
-    (Finn et al. 2017) mean the same and reward minus the distance from the velocity asked for; here every task has the
-    same range of rewards. The observation does not show the velocity asked for: the task's context does.
+    As CheetahRun, but for the reward. MAML's velocity tasks (Finn et al. 2017) mean the same and reward minus the
+    distance from the velocity asked for; here every task has the same range of rewards. The observation does not show
+    the velocity asked for: the task's context does.
+
+    Reward: with the forward velocity v of the centre of mass [m/s],
+            r = max(1 - |v - speed| / speed, 0)
+        Up to ``speed`` it is CheetahRun's own; it falls to 0 at twice that. Returns lie in [0, 1000].
     """
 
     asks: ClassVar[str] = "Make the cheetah run at the given speed."
@@ -200,8 +210,12 @@ class CheetahSpeed(CheetahRun):
 class CheetahDirection(CheetahRun):
     """Direction: run forwards or backwards, as the task says.
 
-    As CheetahRun, but for the reward, which counts the velocity in the task's ``direction``: 1 forwards, -1 backwards.
-    The observation does not show the direction: the task's context does.
+    As CheetahRun, but for the reward. The observation does not show the direction: the task's context does.
+
+    Reward: with the forward velocity v of the centre of mass [m/s], and the task's direction, 1 forwards and -1
+        backwards,
+            r = clip(direction v / speed, 0, 1)
+        where ``speed`` is 10 m/s. Returns lie in [0, 1000].
     """
 
     asks: ClassVar[str] = "Make the cheetah run in the given direction."

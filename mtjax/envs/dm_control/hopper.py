@@ -101,7 +101,9 @@ class Hopper(Domain):
 class HopperStand(Hopper):
     """Stand: hold the torso high over the foot with little effort.
 
-    As high as a hopper should be, the reward is 1 less a fifth of the mean square of the action. There is no ``speed``.
+    Reward: with the action a, and the height h of the torso's centre of mass above the foot's,
+            r = 1 - mean(a^2) / 5 if 0.6 <= h <= 2, else 0
+        There is no ``speed``. Returns lie in [0, 1000].
     """
 
     asks: ClassVar[str] = "Make the hopper stand."
@@ -124,6 +126,10 @@ class HopperHopBackward(Hopper):
     """Hop backwards at 2 m/s or faster, the torso high over the foot.
 
     As HopperHop, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+
+    Reward: with the forward velocity v and the height h as there,
+            r = clip(-v / speed, 0, 1) if 0.6 <= h <= 2, else 0
+        Returns lie in [0, 1000].
     """
 
     parameters: ClassVar = HopperHop.parameters

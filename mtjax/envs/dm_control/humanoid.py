@@ -110,8 +110,9 @@ class Humanoid(Domain):
 class HumanoidStand(Humanoid):
     """Stand: rise, hold the head high and the torso upright, and stay in place with little effort.
 
-    In the reward, the factor of ``move`` gives way to the mean over x and y of a Gaussian of the velocity of the centre
-    of mass, 0.1 at 2 m/s. There is no ``speed``.
+    Reward: as ``Humanoid``'s but for the last factor, with the velocity v of the centre of mass along x and y [m/s],
+            r = standing upright (4 + thrift) / 5 * (0.1^((v_x / 2)^2) + 0.1^((v_y / 2)^2)) / 2
+        There is no ``speed``. Returns lie in [0, 1000].
     """
 
     def moving(self, task: Task, velocity: Array) -> Array:

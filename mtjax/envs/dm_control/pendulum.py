@@ -81,9 +81,12 @@ class PendulumSwingup(Domain):
 class PendulumSpin(PendulumSwingup):
     """Spin: turn the pole round and round at 6 rad/s or faster.
 
-    As PendulumSwingup, but for the reward: 1 where the pole turns in the hinge's positive sense at ``speed`` or faster,
-    falling linearly to 0 at rest. The motor can keep up a mean of some 8 rad/s, of which a turn takes 2 away at the
-    top. Not a task of dm_control: it has the same model, starts and episodes.
+    As PendulumSwingup, but for the reward. The motor can keep up a mean of some 8 rad/s, of which a turn takes 2 away
+    at the top. Not a task of dm_control: it has the same model, starts and episodes.
+
+    Reward: with the pole's velocity omega in the hinge's positive sense [rad/s],
+            r = clip(omega / speed, 0, 1)
+        Returns lie in [0, 1000].
 
     Further parameter: speed [rad/s].
     """

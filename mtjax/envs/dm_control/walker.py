@@ -114,7 +114,12 @@ class Walker(Domain):
 
 @dataclasses.dataclass(frozen=True)
 class WalkerStand(Walker):
-    """Stand: hold the torso high and upright. The reward is ``stand`` alone, and there is no ``speed``."""
+    """Stand: hold the torso high and upright.
+
+    Reward: with ``Walker``'s factors,
+            r = (3 height + upright) / 4
+        There is no ``speed``. Returns lie in [0, 1000].
+    """
 
     asks: ClassVar[str] = "Make the walker stand upright."
 
@@ -143,6 +148,9 @@ class WalkerWalkBackward(Walker):
     """Walk backwards at 1 m/s or faster, upright.
 
     As WalkerWalk, but velocities backwards count. Not a task of dm_control: it has the same model, starts and episodes.
+
+    Reward: as ``Walker``'s, with the forward velocity v of the centre of mass,
+            r = stand (5 move + 1) / 6,  move = clip(-v / speed, 0, 1)
     """
 
     parameters: ClassVar = WalkerWalk.parameters
@@ -151,7 +159,11 @@ class WalkerWalkBackward(Walker):
 
 @dataclasses.dataclass(frozen=True)
 class WalkerRunBackward(Walker):
-    """Run backwards: WalkerWalkBackward at 8 m/s."""
+    """Run backwards: WalkerWalkBackward at 8 m/s.
+
+    Reward: as ``Walker``'s, with the forward velocity v of the centre of mass,
+            r = stand (5 move + 1) / 6,  move = clip(-v / speed, 0, 1)
+    """
 
     parameters: ClassVar = WalkerRun.parameters
     heading: ClassVar[float] = -1.0
@@ -161,9 +173,12 @@ class WalkerRunBackward(Walker):
 class WalkerSpeed(Walker):
     """Speed: move forwards at the task's velocity, neither slower nor faster.
 
-    As WalkerWalk, but move falls linearly on both sides of ``speed``: to 0 at rest and at twice that velocity. (With
-    WalkerWalk's own, whoever masters the fastest task has mastered them all.) The observation does not show the
-    velocity asked for: the task's context does.
+    As WalkerWalk, but for the reward. (With WalkerWalk's own, whoever masters the fastest task has mastered them all.)
+    The observation does not show the velocity asked for: the task's context does.
+
+    Reward: as ``Walker``'s, with the forward velocity v of the centre of mass,
+            r = stand (5 move + 1) / 6,  move = max(1 - |v - speed| / speed, 0)
+        so that move falls to 0 at rest and at twice the velocity asked for.
     """
 
     asks: ClassVar[str] = "Make the walker move at the given speed."
