@@ -69,7 +69,9 @@ class HiddenBandit(HiddenTasks):
 
     Observation (1,): always 0.
     Action: the number of the arm that is pulled; with ``scores`` a score for each (num_arms,).
-    Reward: 1 with the arm's probability, else 0.
+    Reward: with the probability p_a of the arm a that is pulled,
+            r ~ Bernoulli(p_a)
+        that is 1 with this probability, else 0.
     Start: there is one state.
     Episode: one pull; a trial of H pulls is ``--trials=H``.
 
@@ -141,7 +143,8 @@ class GridNavi(HiddenTasks):
     Observation (size^2,): 1 for the cell (x, y) at place ``size x + y``, else 0.
     Action: 0 to 4 for staying, x + 1, x - 1, y + 1 and y - 1; with ``scores`` a score for each (5,). A move off the
         grid stays.
-    Reward: 1 on the goal, else -0.1, after the step.
+    Reward: for the cell (x, y) after the step,
+            r = 1 if (x, y) = goal, else -0.1
     Start: the cell (0, 0).
     Episode: ``steps`` steps; nothing terminates it.
 

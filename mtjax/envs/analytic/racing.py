@@ -68,7 +68,9 @@ class Racing(Pictured, Family):
         to the left from the centre line over half the width, sine and cosine of the heading from the line's; and the
         curvature of the line 2, 4, ... 16 m ahead [1/3 m].
     Action (2,): steering angle [0.4189 rad], to the left; acceleration [9.51 m/s^2].
-    Reward: metres along the centre line; and -20 where the car leaves the track.
+    Reward: with the metres s along the centre line that the step gains, and the offset y from that line [m] after it,
+            r = s - 20 if |y| > width / 2, else s
+        The car has then left the track.
     Start: on the centre line, anywhere, along it at 3 m/s.
     Episode: 600 steps; it terminates where the centre of mass leaves the track, which is ``width`` wide. Metrics
         ``success`` is 1 once a whole lap is driven, ``laps`` is how many.

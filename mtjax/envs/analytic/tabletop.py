@@ -59,9 +59,12 @@ class Tabletop(Pictured, Family):
     Observation (13,): gripper, object and its goal [2.8 m]; 1 if the object is held, else 0; and magnified, what is
         close: the ways from gripper to object, from object to goal and from gripper to (0, 0) [0.4 m], in [-1, 1].
     Action (3,): how the gripper moves along both axes; positive to grip or to hold, else the object is let go.
-    Reward: 1 where all is where it should be, the object at its goal and the gripper at (0, 0):
-        sqrt(|o - goal|^2 + |g|^2) <= 0.2 m. With ``reward_kind=dense`` also the metres by which a step has shortened
-        the way, which is |g| if the object is within 0.1 m of its goal, else |g - o| + |o - goal| + |goal|.
+    Reward: with the ways w before and w' after the step that are left [m],
+            r = u + w - w'  (reward_kind dense)
+            r = u  (reward_kind sparse)
+            u = 1 if sqrt(|o - goal|^2 + |g|^2) <= 0.2, else 0
+            w = |g| if |o - goal| <= 0.1, else |g - o| + |o - goal| + |goal|
+        u is 1 where all is where it should be after the step, the object at its goal and the gripper at (0, 0).
     Start: gripper at (0, 0) and object at (2.5, 0) m, each moved by up to 0.1 m along both axes; nothing is held.
     Episode: 200 steps; nothing terminates it. Metric ``success`` is 1 where all is where it should be.
 

@@ -49,8 +49,11 @@ class CorridorMaze(Pictured, Family):
         ``observe_goal`` (7,): then 1 for the goal's colour and 0 for the others. With ``pixels`` the picture that the
         walker sees, from a height of 0.5 m between walls of 1 m, 75 degrees wide.
     Action (2,): speed [-1, 1] x 2 m/s, ahead or back; turn [-1, 1] x 3 rad/s, to the left.
-    Reward: 1 on touching the ball of the goal's colour, else 0. With ``dense`` also the metres by which a step has
-        shortened the way to it.
+    Reward: with the distance d [m] from the middle of the goal's ball after the step, and the ways w before and w'
+        after it that are left [m],
+            r = u,  u = 1 if d < 0.4, else 0
+            r = u + w - w'  (dense)
+        u is 1 on touching the ball.
     Start: anywhere but in the goal's cell, near the middle of a cell, facing anywhere.
     Episode: 500 steps of 0.1 s; it terminates at the goal. Metric ``success`` is 1 there.
 

@@ -45,8 +45,10 @@ class ColouredMaze(Pictured, DrawnTasks):
     Observation (5 num_colours + 2,): the colours of the walker's square and of those below, above, to the left and to
         the right, each one-hot, and 0 off the maze; x and y from -1 to 1 across the maze.
     Action: 0 to 3 for a square down, up, left and right. A move off the maze stays.
-    Reward: minus the sum of the weights of these five colours where the step has led to, plus normal noise of standard
-        deviation ``noise``. A weight is of a colour in one of the five places.
+    Reward: with the colours c_0 to c_4 of these five squares where the step has led to, the task's weights w of each
+        colour in each of the five places, and normal noise epsilon of deviation 1,
+            r = noise epsilon - sum_i w(i, c_i)
+        Places off the maze cost nothing.
     Start: in the corner at the lower left.
     Episode: 100 steps; it terminates in the opposite corner. Metric ``success`` is 1 there.
 

@@ -72,8 +72,9 @@ class CraftWorld(OnGrid):
         faces, as one-hot. With ``sketched`` then the symbol that is due, one-hot (576,).
     Action: 0 to 3 for down, up, left and right: turn there, and walk if that cell is empty; 4 uses what is ahead. With
         ``sketched`` 5 is STOP.
-    Reward: 1 as soon as the walker has what the task asks for. With ``sketched`` that is looked at after the last
-        symbol, and paid then.
+    Reward: with the number n of what the task asks for that the walker has, and k of K symbols over,
+            r = 1 if n > 0, else 0
+            r = 1 if n > 0 and k >= K, else 0  (sketched)
     Start: in a random cell of a random layout, with nothing, facing down.
     Episode: 100 steps. It terminates with the reward, or with ``sketched`` after the last symbol. Metric ``success`` is
         1 with the reward.

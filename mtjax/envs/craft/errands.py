@@ -67,7 +67,10 @@ class Errands(OnGrid):
         things; where it faces, as one-hot. With ``sketched`` then the symbol that is due, one-hot (566,).
     Action: 0 to 3 for down, up, left and right: turn there, and walk if that cell is empty; 4 uses what is ahead. With
         ``sketched`` 5 is STOP.
-    Reward: 0.5 for using each of both things in its turn. With ``sketched`` 1 after the last symbol if both were.
+    Reward: with c, 1 if the step has used the thing whose turn it is, and else 0; with n, how many were used in their
+        turn and no other; and with k of K symbols over,
+            r = c / 2
+            r = 1 if n = 2 and k >= K, else 0  (sketched)
     Start: in a random cell of a random layout, facing down.
     Episode: 100 steps. It terminates after both things, and without a reward after any other one. Metric ``success`` is
         1 after both things.

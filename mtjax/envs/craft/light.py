@@ -51,7 +51,9 @@ class LightWorld(Sketched):
         both sides if it is straight ahead. Lights of one kind add up. A walker in a door sees that door alone. With
         ``sketched`` then the symbol that is due, one-hot (16,).
     Action: 0 to 3 walk down, up, left and right; 4 takes the key of the walker's cell. With ``sketched`` 5 is STOP.
-    Reward: 1 in the goal's room. With ``sketched`` that is looked at after the last symbol, and paid then.
+    Reward: with the walker's room after the step, and k of K symbols over,
+            r = 1 if room = goal, else 0
+            r = 1 if room = goal and k >= K, else 0  (sketched)
     Start: in the middle of a room, in random rooms.
     Episode: 100 steps. It terminates with the reward, or with ``sketched`` after the last symbol. Metric ``success`` is
         1 with the reward.

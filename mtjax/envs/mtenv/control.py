@@ -56,7 +56,9 @@ class CartPole(Family):
     Observation (4,): position of the cart [m], its velocity [m/s], angle of the pole from upright [rad], its velocity
         [rad/s].
     Action (1,): which way to push: along ``force`` for 0 and above, against it below; the push is always full.
-    Reward: 1 a step, the last one included; returns lie in [1, 500].
+    Reward: at every step, the last one included,
+            r = 1
+        Returns lie in [1, 500].
     Start: all four numbers uniform in [-0.05, 0.05].
     Episode: steps of 0.02 s (explicit Euler); it terminates when the cart is more than 2.4 m from the centre or the
         pole more than 12 degrees from upright, and is cut off after 500 steps, as Gymnasium's CartPole-v1 is.
@@ -115,7 +117,9 @@ class Acrobot(Family):
     Observation (6,): cosine and sine of the first joint's angle from hanging down; cosine and sine of the second
         joint's angle; velocities of both [rad/s].
     Action (1,): torque of the elbow, by thirds: -1 N m below -1/3, 0 up to 1/3, 1 N m from there on.
-    Reward: -1 a step, and 0 for the step that gets there; returns lie in [-500, 0].
+    Reward: with the joints' angles after the step, theta_1 from hanging down and theta_2 from the first link,
+            r = 0 if -cos theta_1 - cos(theta_1 + theta_2) > 1, else -1
+        Returns lie in [-500, 0].
     Start: angles and velocities uniform in [-0.1, 0.1].
     Episode: steps of 0.2 s (one Runge-Kutta step of fourth order, after which speeds are held to 5 pi and 11 pi rad/s);
         it terminates once -cos(angle 1) - cos(angle 1 + angle 2) > 1, and is cut off after 500 steps, as Gymnasium's

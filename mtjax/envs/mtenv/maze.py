@@ -62,7 +62,8 @@ class TwoGoalMaze(Pictured, Choosing, Family):
         red while the walker faces west (heading in (-1.7, -1.5)), else 0, and always 0 at first. With
         ``observe_boxes`` (8,): then x and z of the blue and of the red box, scaled alike.
     Action: 0 turns left by 45 degrees, 1 turns right by 45 degrees, and 2 walks 0.51 m ahead.
-    Reward: 1 on coming within 2 m of the goal, -1 within 2 m of the other box (also if within 2 m of both), else 0.
+    Reward: with the distances d from the goal and e from the other box after the step [m],
+            r = -1 if e < 2, else 1 if d < 2, else 0
     Start: both boxes anywhere in the room of 6 x 6 m where they fit and do not overlap; the walker anywhere in it at
         least 2 m from both, facing one of eight ways.
     Episode: 200 steps; it terminates within 2 m of a box.

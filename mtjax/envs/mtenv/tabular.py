@@ -92,7 +92,9 @@ class TabularMDP(DrawnTasks):
 
     Observation (num_states + 1,): the state as one-hot; the last reward, 0 at first.
     Action: one of ``num_actions`` numbers, from 0.
-    Reward: 1 with the probability that the task gives to this action in this state, else 0.
+    Reward: with the task's table of probabilities, for the state s before the step and the action a,
+            r ~ Bernoulli(rewards(s, a))
+        that is 1 with this probability, else 0.
     Start: any state, all as likely.
     Episode: 100 steps; it never terminates.
 
@@ -161,7 +163,9 @@ class Bandit(DrawnTasks):
 
     Observation (1,): always 0.
     Action: one of ``num_arms`` numbers, from 0: the arm that is pulled.
-    Reward: 1 with the probability that the task gives to this arm, else 0.
+    Reward: with the task's probability of the arm a that is pulled,
+            r ~ Bernoulli(rewards(a))
+        that is 1 with this probability, else 0.
     Start: there is one state.
     Episode: 100 pulls; it never terminates.
 
