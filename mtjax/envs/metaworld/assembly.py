@@ -44,8 +44,14 @@ def _flat(at: Observables) -> Array:
 class Assembly(Sawyer):
     """Put a round nut on a peg (Meta-World's assembly-v3).
 
-    Reward: 10 on success; else the sum of 2 times the caging reward and 6 times how well the nut is over the peg, along
-        a funnel about it, times how flat it lies.
+    Reward: with the nut's centre c, its distance rho from the goal g along x and y, the nut's orientation q, and the
+        distance d of c from the point (g_x, g_y, F), where z counts three times,
+            r = 10  (success)
+            r = (2 C + 6 p) max(1 - |q - (0.707, 0, 0, 0.707)| / 0.4, 0)  (else)
+            p = 0.1 u + 0.9 near(d, 0.02, 0.4),  F = funnel(rho, 0.01, 0.02, 0.2)
+            u = 1 if c_z > 0.02 or rho < 0.01, else 0
+        The last factor is 1 for a nut that lies flat. C is that of the handle, medium with O = 0.015, P = 0.02, X =
+        0.01 and D = 0.01, where o_0 is the nut's; within 0.01 m along x the handle is taken to be where the hand is.
     Success: in x and y, nut and peg are within 0.02 m, and the nut is below the peg's top.
     """
 
@@ -80,8 +86,12 @@ class Assembly(Sawyer):
 class Disassemble(Sawyer):
     """Take a round nut off a peg (Meta-World's disassemble-v3).
 
-    Reward: 10 on success; else the sum of 2 times the caging reward and 6 times a long tail of the nut's way to a point
-        0.1 m above the goal, times how flat it lies.
+    Reward: with the nut's centre c, its distance d from the point 0.1 m above the goal, and its orientation q,
+            r = 10  (success)
+            r = (2 C + 6 p) max(1 - |q - (0.707, 0, 0, 0.707)| / 0.4, 0)  (else)
+            p = 0.1 u + 0.9 near(d, 0.02, 0.2),  u = 1 if c_z > 0.02, else 0
+        The last factor is 1 for a nut that lies flat. C is that of the handle, dense with O = 0.015, P = 0.02 and X =
+        0.01, where o_0 is the nut's; within 0.01 m along x the handle is taken to be where the hand is.
     Success: the handle is higher than the goal.
 
     The goal is 0.15 m above the nut's start; the place that is drawn for it is not used.

@@ -18,9 +18,13 @@ from mtjax.types import Array
 class Basketball(Sawyer):
     """Bring a ball to just above a hoop (Meta-World's basketball-v3).
 
-    Reward: 10 on success; else the product of the caging reward and a long tail of the ball's way to a point above the
-        hoop, at a height of 0.3 m; once the ball is lifted in the gripper, its caging counts as 1, and 1 and 5 times
-        that tail are added.
+    Reward: with the distance d of the ball from a point above the hoop at a height of 0.3 m, where z counts twice,
+            r = 10  (d below 0.08)
+            r = 1 + 6 p  (held and lifted)
+            r = H(C, p)  (else)
+            p = near(d, 0.08, d_0)
+        It is held with the tool centre within 0.035 m and the fingers apart, and lifted by 0.01 m. C is dense with O =
+        0.025, P = 0.06 and X = 0.005.
     Success: the ball is within 0.08 m of that point, where z counts twice.
     """
 

@@ -20,9 +20,15 @@ from mtjax.types import Array
 class BinPicking(Sawyer):
     """Carry a cube from one bin into another (Meta-World's bin-picking-v3).
 
-    Reward: 10 on success; else the product of the caging reward and a long tail of the cube's way to the goal; once the
-        cube is lifted in the gripper, 1 and 5 times the product of that tail and of how well the hand stays above two
-        funnels, about the cube's start and about the goal.
+    Reward: with the cube's distance d from the goal, which is m after the first step of an episode, the hand h, and its
+        distances rho_1 and rho_2 along x and y from the cube's start and from the goal,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 H(A, p)  (held and lifted)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, m),  A = near(max(min(F_1, F_2) - h_z, 0), 0.01, 0.05)
+            F_i = funnel(rho_i, 0.03, 0.02, 0.2)
+        The cube is held with the hand within 0.04 m and the gripper open by 0.43 at least, and lifted by 0.02 m. C is
+        dense with O = 0.015, P = 0.05, X = 0.01 and E = 0.7.
     Success: the cube is within 0.05 m of the goal.
 
     The goal never moves. The tail's margin is the cube's way after the first step of an episode.

@@ -20,9 +20,14 @@ from mtjax.types import Array
 class BoxClose(Sawyer):
     """Put the lid on an open box (Meta-World's box-close-v3).
 
-    Reward: 10 on success; else 8 times how well the lid is lifted to the box, and 2 times the product of how firmly the
-        gripper closes (1 closing, 0 opening) and how well the hand comes to the lid: near it and above a funnel about
-        it. All of it, also the 10, times how upright the lid is.
+    Reward: with the hand h, a point c 0.02 m above the lid's place, the lid's orientation q, the distance d of c from
+        the goal, where z counts three times, and rho, that of h from c along x and y,
+            r = 10 U  (success)
+            r = (2 H((f + 1) / 2, A) + 8 p) U  (else)
+            p = 0.2 u + 0.8 near(d, 0.05, 0.25),  u = 1 if c_z > 0.04, else 0
+            A = H(near(max(F - h_z, 0), 0.01, F / 2), near(|h - c|, 0.02, 0.5))
+            F = funnel(rho, 0.02, 0.04, 0.4),  U = max(1 - |q - (0.707, 0, 0, 0.707)| / 0.2, 0)
+        p tells how well the lid is lifted to the box, A how well the hand comes to it, and U how upright it is.
     Success: the lid is within 0.08 m of the goal.
     """
 

@@ -62,8 +62,10 @@ def press(at: Observables, began: Mapping[str, Array], depth: Array | float) -> 
 class ButtonPress(Sawyer):
     """Press a button from the front (Meta-World's button-press-v3).
 
-    Reward: 2 times the product of how far the gripper is open and how near the tool centre is to the button; with
-        that within 0.05 m, and 8 times a long tail of the way that the button has to go.
+    Reward: with the button b, and the distance d along y that it has to go,
+            r = 2 A + 8 near(d, 0.005, d_0) if |b - t| <= 0.05, else 2 A
+            A = H(e, near(|b - t|, 0.05, |b - t_0|))
+        A tells how well an open gripper comes to the button.
     Success: along y, the button is within 0.02 m of its hole.
     """
 
@@ -83,9 +85,9 @@ class ButtonPress(Sawyer):
 class ButtonPressWall(Sawyer):
     """Press a button over a wall (Meta-World's button-press-wall-v3).
 
-    Reward: with the tool centre beyond 0.07 m of the button, 2 times the product of how far the gripper is closed (0.5
-        closed, 0 open) and how near they are; else 2, and 2 to 4 for an open gripper, and 4 times the square of a
-        long tail of the way that the button has to go.
+    Reward: with the button b, and the distance d along y that it has to go,
+            r = 2 H((1 - e) / 2, near(|b - t|, 0.01, |b - t_0|))  (|b - t| above 0.07)
+            r = 2 + 2 (1 + e) + 4 near(d, 0.005, d_0)^2  (else)
     Success: along y, the button is within 0.03 m of its hole.
     """
 
@@ -108,8 +110,10 @@ class ButtonPressWall(Sawyer):
 class ButtonPressTopdown(Sawyer):
     """Press a button from above (Meta-World's button-press-topdown-v3).
 
-    Reward: 5 times the product of how far the gripper is closed and how near the tool centre is to the button; with
-        that within 0.03 m, and 5 times a long tail of the way that the button has to go.
+    Reward: with the button b, and the distance d along z that it has to go,
+            r = 5 A + 5 near(d, 0.005, d_0) if |b - t| <= 0.03, else 5 A
+            A = H(1 - e, near(|b - t|, 0.01, |b - t_0|))
+        A tells how well a closed gripper comes to the button.
     Success: along z, the button is within 0.024 m of its hole.
     """
 
@@ -128,8 +132,10 @@ class ButtonPressTopdown(Sawyer):
 class ButtonPressTopdownWall(Sawyer):
     """Press a button from above, over a wall (Meta-World's button-press-topdown-wall-v3).
 
-    Reward: 5 times the product of how far the gripper is open and how near the tool centre is to the button; with that
-        within 0.03 m, and 5 times a long tail of the way that the button has to go.
+    Reward: with the button b, and the distance d along z that it has to go,
+            r = 5 A + 5 near(d, 0.005, d_0) if |b - t| <= 0.03, else 5 A
+            A = H(e, near(|b - t|, 0.01, |b - t_0|))
+        A tells how well an open gripper comes to the button.
     Success: along z, the button is within 0.024 m of its hole.
     """
 

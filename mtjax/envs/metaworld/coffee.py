@@ -31,8 +31,10 @@ def _place_mug(host: Host, pos: np.ndarray) -> None:
 class CoffeeButton(Sawyer):
     """Press the button of a coffee machine (Meta-World's coffee-button-v3).
 
-    Reward: 2 times the product of how far the gripper is open and how near the tool centre is to the button; with
-        that within 0.05 m, and 8 times a long tail of the way that the button has to go.
+    Reward: with the button b, and the distance d along y that it has to go,
+            r = 2 A + 8 near(d, 0.005, 0.03) if |b - t| <= 0.05, else 2 A
+            A = H(e, near(|b - t|, 0.05, |b - t_0|))
+        A tells how well an open gripper comes to the button.
     Success: along y, the button is within 0.02 m of the goal.
 
     The observation has the orientation 1, 0, 0, 0 for the button.
@@ -93,8 +95,13 @@ def _move_mug(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tupl
 class CoffeePull(Sawyer):
     """Pull a mug away from under a coffee machine (Meta-World's coffee-pull-v3).
 
-    Reward: 10 with the mug at the goal (0.05 m, where x and y count twice); else the product of the caging reward and
-        a long tail of the mug's way to the goal, and once the mug is held, 1 and 5 times that tail.
+    Reward: with the mug's distance d from the goal, where x and y count twice,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 p  (held)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The mug is held with the tool centre within 0.04 m and the fingers apart. C is medium with O = 0.02, P = 0.05, X
+        = 0.05, D = 0.04 and E = 0.7.
     Success: the mug is within 0.07 m of the goal.
 
     The observation has the mug's orientation as x, y, z, w.
@@ -115,8 +122,13 @@ class CoffeePull(Sawyer):
 class CoffeePush(Sawyer):
     """Push a mug under a coffee machine (Meta-World's coffee-push-v3).
 
-    Reward: 10 with the mug at the goal (0.05 m, where x and y count twice); else the product of the caging reward and
-        a long tail of the mug's way to the goal, and once the mug is held, 1 and 5 times that tail.
+    Reward: with the mug's distance d from the goal, where x and y count twice,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 p  (held)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The mug is held with the tool centre within 0.04 m and the fingers apart. C is medium with O = 0.02, P = 0.05, X
+        = 0.05, D = 0.04 and E = 0.7.
     Success: the mug is within 0.07 m of the goal.
 
     The observation has the mug's orientation as x, y, z, w.

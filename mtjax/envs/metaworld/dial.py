@@ -23,8 +23,11 @@ _PUSH = (0.05, 0.02, 0.09)  # from the dial's mark to where it should be pushed
 class DialTurn(Sawyer):
     """Turn a dial until its mark points away from the robot (Meta-World's dial-turn-v3).
 
-    Reward: 10 times the product of how near the tool centre is to the place to push, how firmly the gripper closes,
-        and how near the mark is to the goal.
+    Reward: with the distance d of the dial's mark from the goal, the place a where it should be pushed, which moves
+        with the mark, and g the goal,
+            r = 10 H(H(A, clip(f, 0, 1)), p)
+            A = gauss(|a - t|, 0.005, ||a_0 - t_0| - 0.005|)
+            p = near(d, 0.07, ||a_0 - g| - 0.07|)
     Success: the mark is within 0.07 m of the goal.
     """
 

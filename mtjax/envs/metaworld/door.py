@@ -33,8 +33,14 @@ def _arrange(host: Host, vec: np.ndarray, angle: float, goal: tuple[float, ...])
 class DoorOpen(Sawyer):
     """Open a door: pull it by its handle (Meta-World's door-open-v3).
 
-    Reward: 10 on success; else 8 times how far the door is open, and 2 times the product of how firmly the gripper
-        closes (1 closing, 0 opening) and how well the hand comes to the handle: near it and above a funnel about it.
+    Reward: with the door's angle phi, which is 0 closed and negative open, the handle o, the hand h, and rho, the
+        distance along x and y of h from a point 0.05 m to the left of the handle,
+            r = 10  (success)
+            r = 2 H(A, (f + 1) / 2) + 8 p  (else)
+            p = 0.2 u + 0.8 near(phi + 2 pi / 3, 0.5, pi / 3),  u = 1 if phi < -pi / 90, else 0
+            A = H(near(max(F - h_z, 0), 0.01, F / 2), near(|h - o - (0, 0.03, -0.01)|, 0.06, 0.5))
+            F = funnel(rho, 0.12, 0.04, 0.4)
+        p tells how far the door is open, and A how well the hand comes to the handle.
     Success: along x, the handle is within 0.08 m of the goal.
 
     The observation has the handle's orientation as x, y, z, w.
@@ -65,8 +71,9 @@ class DoorOpen(Sawyer):
 class DoorClose(Sawyer):
     """Close a door that is wide open (Meta-World's door-close-v3).
 
-    Reward: 10 with the handle within 0.05 m of the goal; else 6 times a Gaussian of the way from handle to goal, and 3
-        times one of the way from tool centre to goal.
+    Reward: with the handle o, the goal g, o_0 the door's drawn place, and h_0 where the hand begins,
+            r = 10  (|o - g| below 0.05)
+            r = 3 gauss(|t - g|, 0.0125, |h_0 - o| + 0.1) + 6 gauss(|o - g|, 0.05, |o_0 - g|)  (else)
     Success: the handle is within 0.08 m of the goal.
 
     The observation has the handle's orientation as x, y, z, w.

@@ -23,8 +23,9 @@ _OPEN = 0.2  # [m] that the drawer is to be pulled
 class DrawerOpen(Sawyer):
     """Open a drawer: pull its handle by 0.2 m (Meta-World's drawer-open-v3).
 
-    Reward: 5 times the sum of two long tails: of the way from handle to goal, and of that from hand to handle, where x
-        and y count three times, so that the hand comes to the handle from above.
+    Reward: with the handle o, its distance d from the goal, the hand h, and o_0 the place 0.2 m behind the goal,
+            r = 5 near(|w (o - h)|, 0.01, |w (o_0 - t_0)|) + 5 near(d, 0.02, 0.2)
+        where w = (3, 3, 1), so that the hand comes to the handle from above.
     Success: the handle is within 0.03 m of the goal.
     """
 
@@ -53,8 +54,10 @@ class DrawerOpen(Sawyer):
 class DrawerClose(Sawyer):
     """Close a drawer: push its handle by 0.15 m (Meta-World's drawer-close-v3).
 
-    Reward: 10 on success; else 10 times the product of how near tool centre and handle are, how firmly the gripper
-        closes, and how near the handle is to the goal.
+    Reward: with the handle o, and its distance d from the goal,
+            r = 10  (success)
+            r = 10 H(H(A, clip(f, 0, 1)), near(d, 0.05, |d_0 - 0.05|))  (else)
+            A = gauss(|o - t|, 0.005, ||o_0 - t_0| - 0.005|)
     Success: the handle is within 0.065 m of the goal.
 
     The observation has zeros for the drawer's orientation. The handle of the closed drawer is 0.051 m from the goal.

@@ -40,8 +40,9 @@ def _turn(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Ar
 class FaucetOpen(Sawyer):
     """Faucet open: turn the faucet's handle from the front to the right.
 
-    Reward: 4 for the tool centre at the handle's end and 6 for the handle's end at the target, each falling with the
-        distance; 10 within 0.07 m of the target.
+    Reward: with the handle's end o, its distance d from the target, and for o_0 and d_0 the faucet's drawn place,
+            r = 10  (success)
+            r = 4 gauss(|o - t|, 0.01, ||o_0 - t_0| - 0.01|) + 6 near(d, 0.07, |d_0 - 0.07|)  (else)
     Success: the handle's end is within 0.07 m of the target.
     Start: the faucet at the drawn place, its handle pointing to the robot.
 
@@ -68,8 +69,9 @@ class FaucetOpen(Sawyer):
 class FaucetClose(Sawyer):
     """Faucet close: turn the faucet's handle from the front to the left.
 
-    Reward: 4 for the tool centre at the handle's end and 6 for the handle's end at the target, each falling with the
-        distance; 10 within 0.07 m of the target.
+    Reward: with the handle's end o, its distance d from the target, and for o_0 and d_0 the faucet's drawn place,
+            r = 10  (success)
+            r = 4 gauss(|o - t|, 0.01, ||o_0 - t_0| - 0.01|) + 6 near(d, 0.07, |d_0 - 0.07|)  (else)
     Success: the handle's end, which is where the observation shows it, is within 0.07 m of the target.
     Start: the faucet at the drawn place, its handle pointing to the robot.
     """

@@ -20,8 +20,13 @@ _NAIL = 16  # in qpos, after the free hammer
 class Hammer(Sawyer):
     """Hammer: pick up the hammer and drive the nail into the block.
 
-    Reward: 2 for caging the handle, 0.6 for a lifted hammer, 5.4 for its head at the nail's final place; all times how
-        level the hammer lies, from 1 down to 0. 10 if the nail is driven in and the reward exceeds 5.
+    Reward: with the place c of the hammer's head, its distance d from the nail's final place, and the hammer's
+        orientation q,
+            r = 10  (success, and the next line above 5)
+            r = (2 C + 6 p) max(1 - |q - (1, 0, 0, 0)| / 0.4, 0)  (else)
+            p = 0.1 u + 0.9 near(d, 0.02, 0.2),  u = 1 if c_z > 0.02, else 0
+        The last factor is 1 for a hammer that lies level. C is that of the handle, dense with O = 0.015, P = 0.02 and X
+        = 0.01.
     Success: the nail is in by more than 0.09 m.
     Start: the hammer at the drawn place, the block always at the same one.
 

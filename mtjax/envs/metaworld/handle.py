@@ -47,8 +47,9 @@ def _pressed(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple
 class HandlePress(Sawyer):
     """Handle press: press the handle down.
 
-    Reward: 10 times the Hamacher product of the tool centre at the handle and the handle at the target's height; 10
-        within 0.02 m of that height.
+    Reward: with the handle o, and its distance d from the target's height,
+            r = 10  (success)
+            r = 10 H(near(|o - t|, 0.02, ||o_0 - t_0| - 0.02|), near(d, 0.02, |d_0 - 0.02|))  (else)
     Success: the handle is within 0.02 m of the target's height.
     Start: the box at the drawn place, its handle up.
     """
@@ -65,8 +66,9 @@ class HandlePress(Sawyer):
 class HandlePressSide(Sawyer):
     """Handle press side: press down a handle that stands to the left and points to the right.
 
-    Reward: 10 times the Hamacher product of the tool centre at the handle and the handle at the target's height; 10
-        within 0.02 m of that height.
+    Reward: with the handle o, and its distance d from the target's height,
+            r = 10  (success)
+            r = 10 H(near(|o - t|, 0.02, ||o_0 - t_0| - 0.02|), near(d, 0.02, |d_0 - 0.02|))  (else)
     Success: the handle is within 0.02 m of the target's height.
     Start: the box at the drawn place, its handle up.
     """
@@ -83,8 +85,13 @@ class HandlePressSide(Sawyer):
 class HandlePull(Sawyer):
     """Handle pull: pull the handle up.
 
-    Reward: the Hamacher product of caging the handle and the handle at the target's height; 1 and 5 times the latter
-        more while the open gripper is within 0.035 m of the handle; 10 within 0.05 m of the target's height.
+    Reward: with the handle's distance d from the target's height,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 p  (held)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The handle is held with the tool centre within 0.035 m and the fingers apart. C is dense with O = 0.022, P =
+        0.05 and X = 0.01.
     Success: the handle is within 0.05 m of the target's height.
     Start: the box at the drawn place, its handle down.
 
@@ -118,8 +125,13 @@ class HandlePull(Sawyer):
 class HandlePullSide(Sawyer):
     """Handle pull side: pull up a handle that stands to the left and points to the right.
 
-    Reward: the Hamacher product of caging the handle and the handle at the target; 1 and 5 times the latter more while
-        the open gripper is within 0.035 m of the handle and that rose by 0.01 m; 10 within 0.05 m of the target.
+    Reward: with the handle's distance d from the target,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 p  (held and risen)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The handle is held with the tool centre within 0.035 m and the fingers apart, and has risen by 0.01 m. C is
+        dense with O = 0.032, P = 0.06 and X = 0.01.
     Success: the handle is within 0.08 m of the target.
     Start: the box at the drawn place, its handle down.
     """

@@ -29,8 +29,13 @@ def _show(self: Sawyer, at: Observables) -> tuple[Array, ...]:
 class HandInsert(Sawyer):
     """Hand insert: take the block and put it into the hole with the hand.
 
-    Reward: the Hamacher product of caging the block and the block at the target; 1 and 7 times the latter more while
-        the open gripper is within 0.02 m of the block; 10 within 0.05 m of the target.
+    Reward: with the block's distance d from the target,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 7 p  (held)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The block is held with the tool centre within 0.02 m and the fingers apart. C is dense with O = 0.015, P = 0.05
+        and X = 0.005.
     Success: the block is within 0.05 m of the target.
     Start: the block at the drawn place, dropped from 0.05 m.
     """
@@ -56,9 +61,15 @@ class HandInsert(Sawyer):
 class PickOutOfHole(Sawyer):
     """Pick out of hole: take the puck out of the hole and lift it to the target.
 
-    Reward: the Hamacher product of caging the puck and the puck at the target; more while the puck is held and lifted
-        by 0.02 m: 1, and 5 times the Hamacher product of the latter and the hand above a funnel around the hole; 10
-        within 0.05 m of the target.
+    Reward: with the puck's distance d from the target, and rho, that of the tool centre from the puck's start along x
+        and y,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 H(p, A)  (held and lifted)
+            r = H(C, p)  (else)
+            p = near(d, 0.02, d_0)
+            A = near(max(funnel(rho, 0.03, 0.015, 0.15) - t_z, 0), 0.01, 0.02)
+        The puck is held with the tool centre within 0.04 m and the gripper open by 0.33 at least, and lifted by 0.02 m.
+        C is dense with O = 0.015, P = 0.02, X = 0.03 and E = 0.1.
     Success: the puck is within 0.07 m of the target.
     Start: the puck in the hole, always at the same place.
 

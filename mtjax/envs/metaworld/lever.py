@@ -28,8 +28,10 @@ _GRIP = (
 class LeverPull(Sawyer):
     """Lever pull: push the lever up from below until it stands upright.
 
-    Reward: 10 times the Hamacher product of the hand's shoulder below the lever's end, where y counts a quarter of x
-        and z, and the lever's end at the target.
+    Reward: with the lever's end o, its distance d from the target, the hand h, and the way v = (0, 0.055, 0.07) from
+        there to its shoulder,
+            r = 10 H(near(|w (h + v - o)|, 0.02, |w (t_0 + v - o_0)|), near(d, 0.04, d_0))
+        where w = (4, 1, 4).
     Success: the lever stands within 7.5 degrees of upright.
     Start: the lever at the drawn place, pointing to the robot.
 

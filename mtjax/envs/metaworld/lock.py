@@ -23,9 +23,11 @@ _WEIGHT = (0.25, 1.0, 0.5)  # of a way to the lock in x, y and z
 class DoorLock(Sawyer):
     """Lock a door: turn its lock down (Meta-World's door-lock-v3).
 
-    Reward: 8 times a long tail of the lock's way to the goal along z, and 2 times the product of how far the gripper is
-        open and how near the left pad is to the lock. The margin of the latter is meant to be the distance at the
-        start; it is that of now, as Meta-World keeps a view of the pad's place, so that only the last cm count.
+    Reward: with the distance d of the lock from the goal along z, and a from the lock to the left pad, where x counts a
+        quarter and z half,
+            r = 2 H(e, near(a, 0.01, a)) + 8 near(d, 0.005, 0.1)
+        The margin a is meant to be the distance at the start; it is that of now, as Meta-World keeps a view of the
+        pad's place, so that only the last cm count.
     Success: along z, the lock is within 0.02 m of the goal.
     """
 
@@ -58,8 +60,10 @@ class DoorLock(Sawyer):
 class DoorUnlock(Sawyer):
     """Unlock a door: push its lock up and aside (Meta-World's door-unlock-v3).
 
-    Reward: 8 times a long tail of the lock's way to the goal along x, and 2 times one of the way from the hand's
-        shoulder to the lock.
+    Reward: with the lock o, its distance d from the goal along x, the hand h, and the way v = (0, 0.055, 0.07) from
+        there to its shoulder,
+            r = 2 near(|w (h + v - o)|, 0.02, |w (t_0 + v - o_0)|) + 8 near(d, 0.005, 0.1)
+        where w = (0.25, 1, 0.5).
     Success: along x, the lock is within 0.02 m of the goal.
     """
 

@@ -36,9 +36,14 @@ def _inside_box(point: Array, corners: Array) -> Array:
 class PegInsertSide(Sawyer):
     """Peg insert side: pick up the peg and put it sideways into the block's hole.
 
-    Reward: the Hamacher product of caging the peg and its head at the hole, where y and z count twice, lowered where
-        the head is before the block below or above the hole. While the peg is held and lifted by 0.01 m, caging counts
-        as 1, and 1 and 5 times the latter come on top; 10 within 0.07 m of the hole.
+    Reward: with the distance d from the peg's head to the hole, where y and z count twice,
+            r = 10  (success)
+            r = 1 + 6 p  (held and lifted)
+            r = H(C, p)  (else)
+            p = H(near(d, 0.07, d_0), H(U_1, U_2))
+        U_1 and U_2 are 1, but where the head is in a box before the block, above or below the hole: there they are the
+        product of the shares of the way through the box along x, y and z. The peg is held with the tool centre within
+        0.08 m and the fingers apart, and lifted by 0.01 m. C is dense with O = 0.0075, P = 0.03 and X = 0.005.
     Success: the peg's head is within 0.07 m of the hole, y and z counted twice.
     Start: peg and block at the drawn places.
 
@@ -78,9 +83,13 @@ class PegInsertSide(Sawyer):
 class PegUnplugSide(Sawyer):
     """Peg unplug side: pull the plug sideways out of the block.
 
-    Reward: twice the caging of the plug; 1 and 5 times the plug at the target more while the gripper is open by more
-        than half, within 0.035 m of the plug, and the plug moved to the right by 0.015 m; 10 within 0.05 m of the
-        target.
+    Reward: with the distance d of the plug's end from the target,
+            r = 10  (d at most 0.05)
+            r = 2 C + 1 + 5 p  (held and moved)
+            r = 2 C  (else)
+            p = near(d, 0.05, d_0)
+        The plug is held with the tool centre within 0.035 m and the gripper open by more than half, and moved to the
+        right by 0.015 m. C is dense with O = 0.025, P = 0.05, X = 0.005 and E = 0.8.
     Success: the plug's end is within 0.07 m of the target, 0.15 m to the right of where the plug was.
     Start: the block at the drawn place, and the plug in it. The plug turns as it did while the hand settled, when it
         fell; only its place, direction and velocity are set.

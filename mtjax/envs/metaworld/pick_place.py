@@ -30,8 +30,13 @@ def _lifted(at: Observables, began: Mapping[str, Array], height: float) -> Array
 class PickPlace(Sawyer):
     """Pick and place: lift the puck to a goal in the air (Meta-World's pick-place-v3).
 
-    Reward: Hamacher's product of a gripper about the puck and the puck's nearness to the goal; once the puck is lifted
-        by 0.01 m, 1 more and 5 for that nearness; 10 at the goal.
+    Reward: with the puck's distance d from the goal,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 p  (held and lifted)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The puck is held with the tool centre within 0.02 m and the fingers apart, and lifted by 0.01 m. C is dense with
+        O = 0.015 and X = 0.005, where pads count as in tasks that pinch.
     Success: the puck is within 0.07 m of the goal.
     """
 
@@ -52,9 +57,15 @@ class PickPlace(Sawyer):
 class PickPlaceWall(Sawyer):
     """Pick and place over a wall: lift the puck to a goal behind a wall (Meta-World's pick-place-wall-v3).
 
-    Reward: Hamacher's product of a gripper about the puck and the puck's nearness to a point over the wall; once the
-        puck is lifted by 0.015 m, 1 more and 4 for that nearness; behind the wall, 5 more and 3 for its nearness to
-        the goal; 10 at the goal.
+    Reward: with the puck's distances d from the goal, and a from a point over the wall, where z counts three times,
+            r = 10  (d below 0.05)
+            r = H(C, s) + 5 + 3 p  (held, lifted and past the wall)
+            r = H(C, s) + 1 + 4 s  (held and lifted)
+            r = H(C, s)  (else)
+            p = near(d, 0.05, d_0),  s = near(a, 0.05, a_0)
+        The puck is held with the tool centre within 0.02 m and the fingers apart, and lifted by 0.015 m; it is past the
+        wall from y = 0.75 on. The point is (g_x, 0.77, 0.25), with the goal's x. C is plain with O = 0.015, P = 0.05
+        and X = 0.005.
     Success: the puck is within 0.07 m of the goal.
     """
 

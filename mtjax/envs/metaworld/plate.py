@@ -41,8 +41,9 @@ def _pull(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[Ar
 class PlateSlide(Sawyer):
     """Plate slide: slide the plate forward into the goal.
 
-    Reward: 8 times the Hamacher product of the tool centre at the plate and the plate at the target; 10 within 0.05 m
-        of the target.
+    Reward: with the plate o, and its distance d from the target,
+            r = 10  (d below 0.05)
+            r = 8 H(near(|o - t|, 0.05, |o_0 - t_0|), near(d, 0.05, d_0))  (else)
     Success: the plate is within 0.07 m of the target.
     Start: the plate at its place, the goal at the drawn one.
     """
@@ -68,8 +69,10 @@ class PlateSlide(Sawyer):
 class PlateSlideBack(Sawyer):
     """Plate slide back: slide the plate back out of the goal, towards the robot.
 
-    Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
-        centre is below 0.03 m and within 0.07 m of the plate; 10 within 0.05 m of the target.
+    Reward: with the plate o, and its distance d from the target,
+            r = 10  (d below 0.05)
+            r = 2 + 7 near(d, 0.05, d_0 - 0.05)  (t_z at most 0.03, and |o - t| below 0.07)
+            r = 1.5 near(|o - t|, 0.05, |o_0 - t_0| - 0.05)  (else)
     Success: the plate is within 0.07 m of the target.
     Start: the plate 0.15 m forward. The goal's net stays where the scene has it.
     """
@@ -87,8 +90,10 @@ class PlateSlideBack(Sawyer):
 class PlateSlideSide(Sawyer):
     """Plate slide side: slide the plate to the left into the goal.
 
-    Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
-        centre is below 0.03 m and within 0.07 m of the plate; 10 within 0.05 m of the target.
+    Reward: with the plate o, and its distance d from the target,
+            r = 10  (d below 0.05)
+            r = 2 + 7 near(d, 0.05, d_0 - 0.05)  (t_z at most 0.03, and |o - t| below 0.07)
+            r = 1.5 near(|o - t|, 0.05, |o_0 - t_0| - 0.05)  (else)
     Success: the plate is within 0.07 m of the target.
     Start: the plate at its place. The goal's net stays where the scene has it, wherever the target is.
     """
@@ -106,8 +111,10 @@ class PlateSlideSide(Sawyer):
 class PlateSlideBackSide(Sawyer):
     """Plate slide back side: slide the plate to the right out of the goal.
 
-    Reward: 1.5 times the tool centre at the plate; instead 2, and 7 times the plate at the target, while the tool
-        centre is below 0.03 m and within 0.07 m of the plate; 10 within 0.05 m of the target.
+    Reward: with the plate o, and its distance d from the target,
+            r = 10  (d below 0.05)
+            r = 2 + 7 near(d, 0.05, d_0 - 0.05)  (t_z at most 0.03, and |o - t| below 0.07)
+            r = 1.5 near(|o - t|, 0.05, |o_0 - t_0| - 0.05)  (else)
     Success: the plate is within 0.07 m of the target.
     Start: the goal's net at the drawn place of the plate, and the plate 0.1 m to the right of it.
     """

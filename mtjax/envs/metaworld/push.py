@@ -46,8 +46,13 @@ def _held(at: Observables, began: Mapping[str, Array]) -> Array:
 class Push(Sawyer):
     """Push: bring the puck to a goal on the table (Meta-World's push-v3).
 
-    Reward: 2 for a gripper about the puck; once it is there, 1 more, twice the former and 5 for the puck's nearness to
-        the goal; 10 at the goal.
+    Reward: with the puck's distance d from the goal,
+            r = 10  (d below 0.05)
+            r = 4 C + 1 + 5 p  (held)
+            r = 2 C  (else)
+            p = near(d, 0.05, d_0)
+        The puck is held with the tool centre within 0.02 m and the fingers apart. C is dense with O = 0.015, P = 0.05
+        and X = 0.005.
     Success: the puck is within 0.05 m of the goal.
     """
 
@@ -68,8 +73,14 @@ class Push(Sawyer):
 class PushWall(Sawyer):
     """Push around a wall: bring the puck to a goal behind a wall (Meta-World's push-wall-v3).
 
-    Reward: 2 for a gripper about the puck; once it is there, 1 more and 4 for the puck's nearness to the wall's end;
-        behind the wall, 5 more and 3 for its nearness to the goal; 10 at the goal.
+    Reward: with the puck's distances d from the goal, and a from the wall's end, where x counts three times,
+            r = 10  (d below 0.05)
+            r = 2 C + 5 + 3 p  (held and past the wall)
+            r = 2 C + 1 + 4 near(a, 0.05, a_0)  (held)
+            r = 2 C  (else)
+            p = near(d, 0.05, d_0)
+        The puck is held with the tool centre within 0.02 m and the fingers apart, and past the wall from y = 0.75 on.
+        The wall's end is (-0.05, 0.77) at the puck's height. C is dense with O = 0.015, P = 0.05 and X = 0.005.
     Success: the puck is within 0.07 m of the goal.
     """
 
@@ -94,8 +105,13 @@ class PushWall(Sawyer):
 class PushBack(Sawyer):
     """Push back: pull the puck to a goal that is nearer to the robot (Meta-World's push-back-v3).
 
-    Reward: Hamacher's product of a gripper about the puck and the puck's nearness to the goal; once the puck is held
-        and has moved, 1 more and 5 for that nearness; 10 at the goal.
+    Reward: with the puck's distance d from the goal,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 p  (held and moved)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+        The puck is held with the tool centre within 0.01 m and 0 < e < 0.55, and has moved where it is nearer to the
+        goal by 0.01 m than at the start. C is pinching with O = 0.007, W = 0.003 and X = 0.01.
     Success: the puck is within 0.07 m of the goal.
     """
 

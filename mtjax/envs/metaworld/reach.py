@@ -30,8 +30,8 @@ def _reach(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[A
 class Reach(Sawyer):
     """Reach: bring the gripper to a point in the air (Meta-World's reach-v3).
 
-    Reward: 10 times a long-tailed function of the distance from tool centre to goal, with a margin of the way from the
-        start.
+    Reward: with the goal g, and h_0 where the hand begins,
+            r = 10 near(|t - g|, 0.05, |h_0 - g|)
     Success: the tool centre is within 0.05 m of the goal.
     """
 
@@ -46,8 +46,8 @@ class Reach(Sawyer):
 class ReachWall(Sawyer):
     """Reach over a wall: bring the gripper to a point behind a wall (Meta-World's reach-wall-v3).
 
-    Reward: 10 times a long-tailed function of the distance from tool centre to goal, with a margin of the way from the
-        start.
+    Reward: with the goal g, and h_0 where the hand begins,
+            r = 10 near(|t - g|, 0.05, |h_0 - g|)
     Success: the tool centre is within 0.05 m of the goal.
     """
 

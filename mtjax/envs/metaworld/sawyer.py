@@ -55,7 +55,27 @@ class Sawyer(Domain):
         clipped to Meta-World's ranges.
     Action (4,): in [-1, 1], the way of the hand's target in x, y and z, of 0.01 m at most, inside the task's box; and
         the force that closes the gripper.
-    Reward: Meta-World's second version, from 0 to 10.
+    Reward: Meta-World's second version, from 0 to 10. Where a task has several formulas, the first counts whose
+        condition holds. Distances are in m. In all of them t is the tool centre, e how far the gripper is open, f the
+        action's closing force in [-1, 1], q an orientation, and an index 0 stands for an episode's start. A distance d
+        within R counts 1, and beyond it less: 0.1 at a margin m from there, or 0 everywhere if m is not positive.
+            near(d, R, m) = 1 / (1 + (3 max(d - R, 0) / m)^2)
+            gauss(d, R, m) = 0.1^((max(d - R, 0) / m)^2)
+            H(a, b) = a b / (a + b - a b)  (Hamacher's product, an "and")
+            funnel(rho, R, k, z) = k log(rho - R) + z if rho > R, else 0  (height of a funnel at rho from its axis)
+        C tells how well the gripper cages a thing. With its place o = (x, y, z), the left and the right pad at y_1 and
+        y_2, and O, P, X, D and E as the task has them (E is 1 where it names none),
+            C = H(K, G)  (plain)
+            C = (H(K, G) + K) / 2  (dense)
+            C = (H(K, G) + near(|o - t|, D, ||o_0 - t_0| - D|)) / 2  (medium)
+            K = H(H(B(s_1, P), B(s_2, P)), near(|o - t|_xz, X, |o_0 - t_0|_xz - X))  (how well it is around the thing)
+            G = clip(f / E, 0, 1) if K > 0.97, else 0  (how firmly it closes)
+            B(s_i, u) = 1 / (1 + (3 max(O - s_i, s_i - u, 0) / m_i)^2)  (a pad is between O and u from the thing)
+            s_i = |y_i - y|,  m_i = ||y_i - y_0| - P|
+        In some tasks pads count otherwise, with P = 0.05, and pinch the thing, with the task's W:
+            s_1 = y_1 - y,  s_2 = y - y_2,  m_i = ||s_i| - P|
+            C = (K + N) / 2  (pinching)
+            N = H(B(s_1, O + W), B(s_2, O + W)) if K > 0.95, else 0
     Metrics: success (0 or 1) after the step.
     Start: the settled hand, and the things as one of ``num_draws`` goals has them; each episode draws a goal. With 50
         they are the goals of Meta-World's benchmark of the seed ``task_seed``, number for number.

@@ -22,9 +22,17 @@ _DEPTH = 0.15  # [m] before the target, from where the block counts as below the
 class ShelfPlace(Sawyer):
     """Shelf place: pick up the block and put it on the shelf's board.
 
-    Reward: the Hamacher product of caging the block and the block at the target. While the block is held and lifted by
-        0.01 m, 1 and 5 times the latter more, which is lowered where the block is before the board and below it, and 0
-        where it is beneath the board; 10 within 0.05 m of the target.
+    Reward: with the block (x, y, z), its distance d from the target g,
+            r = 10  (d below 0.05)
+            r = H(C, p) + 1 + 5 clip(p - b, 0, 1)  (held and lifted)
+            r = H(C, p)  (else)
+            p = near(d, 0.05, d_0)
+            b = H(1 - (g_y - y) / 0.15, 1 - z / 0.24)  (before the board and below it)
+            b = 1  (beneath the board)
+            b = 0  (else)
+        The block is low with 0 < z < 0.24 and |x - g_x| < 0.15; it is then beneath the board where y exceeds g_y, and
+        before it where y is less by up to 0.15 m. It is held with the tool centre within 0.025 m and the fingers apart,
+        and lifted by 0.01 m. C is plain with O = 0.02, P = 0.05 and X = 0.01.
     Success: the block is within 0.07 m of the target.
     Start: the block at the drawn x and y, at the height where it lay while the hand settled; the shelf 0.3 m below the
         drawn target.

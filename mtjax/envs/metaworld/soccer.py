@@ -20,8 +20,13 @@ _RADIUS = 0.07  # [m] of the target
 class Soccer(Sawyer):
     """Soccer: push the ball into the goal.
 
-    Reward: 3 for pinching the ball and 6.5 for the ball at the target, where x counts three times; the latter falls for
-        a ball that passes beside the goal, behind the line 0.1 m before the target; 10 within 0.07 m of the target.
+    Reward: with the ball o = (x, y, z), its distance d from the target g, and a from its own start, where x counts
+        three times in both,
+            r = 10  (d below 0.07)
+            r = 3 C + 6.5 clip(p - 2 (y - l) / (1 - l), 0, 1)  (y above l, |x - g_x| above 0.1: it passes beside)
+            r = 3 C + 6.5 p  (else)
+            p = near(d, 0.07, a),  l = g_y - 0.1
+        C is pinching with O = 0.013, W = 0.01 and X = 0.005.
     Success: the ball is within 0.07 m of the target, all axes counted once.
     Start: the ball at the drawn x and y, the goal at the drawn target.
 

@@ -37,8 +37,12 @@ def _show(at: Observables, flask: Array) -> tuple[Array, ...]:
 class StickPush(Sawyer):
     """Stick push: pick up the stick and push the flask with it.
 
-    Reward: caging the stick. While the stick is held and lifted by 0.01 m, instead 2, 5 times the stick at the target
-        and 3 times the flask at the target; then 10 within 0.12 m of the target.
+    Reward: with the distances from the target, s of the stick 0.015 m to its right, and d of the flask,
+            r = 10  (held and lifted, d at most 0.12)
+            r = 2 + 5 near(s, 0.12, s_0 - 0.12) + 3 near(d, 0.12, d_0 - 0.12)  (held and lifted)
+            r = C  (else)
+        The stick is held with the tool centre within 0.02 m and the fingers apart, and lifted by 0.01 m. C is that of
+        the stick, dense with O = 0.04, P = 0.05 and X = 0.01.
     Success: the flask is within 0.12 m of the target while the stick is lifted by 0.01 m and both pads press on it.
     Start: the stick at the drawn x and y, the flask always at the same place; the target at the drawn x and y, at the
         height of the flask's handle.
@@ -84,10 +88,15 @@ class StickPush(Sawyer):
 class StickPull(Sawyer):
     """Stick pull: pick up the stick, put it through the flask's handle and pull the flask with it.
 
-    Reward: the Hamacher product of caging the stick and the stick at the flask, where z counts twice. While the stick
-        is held and lifted by 0.01 m, caging counts as 1, and 1 and 5 times the stick at the flask come on top; or, once
-        the stick is through the handle, 6, twice the stick at the target and the flask at the target; then 10 with the
-        handle within 0.12 m of the target.
+    Reward: with the flask's handle c, the flask o taken 0.05 m to the right of it, the stick s, and the target g,
+            r = 10  (held, lifted and through the handle, with c within 0.12 of the target)
+            r = 6 + p + 2 near(|s - g|, 0.05, |s_0 - g|) + near(|o - g|, 0.05, |o_0 - g|)  (held, lifted and through)
+            r = 1 + 6 p  (held and lifted)
+            r = H(C, p)  (else)
+            p = near(|w (s - o)|, 0.05, |w (s_0 - o_0 - (0.05, 0, 0))|)
+        where w = (1, 1, 2). The stick is held with the tool centre within 0.02 m and the fingers apart, and lifted by
+        0.01 m; it is through the handle with its end to the right of it, within 0.04 m along y and 0.06 m along z. C is
+        that of the stick, dense with O = 0.014, P = 0.05 and X = 0.01.
     Success: the handle is within 0.12 m of the target, and the stick through it.
     Start: the stick at the drawn x and y, the flask always at the same place; the target at the drawn x and y.
 

@@ -35,8 +35,10 @@ def _sweep(at: Observables, began: Mapping[str, Array], target: Array, grip: flo
 class Sweep(Sawyer):
     """Sweep: sweep the block to the right, off the table.
 
-    Reward: 2 for pinching the block, and 6 times the Hamacher product of that and the block at the target; 10 within
-        0.05 m of the target.
+    Reward: with the block's distance d from the target,
+            r = 10  (d below 0.05)
+            r = 2 C + 6 H(C, near(d, 0.05, d_0))  (else)
+        C is pinching with O = 0.02, W = 0.01 and X = 0.005.
     Success: the block is within 0.05 m of the target.
     Start: the block at the drawn x and y; the target is at the table's edge, x = 0.5 m, at the same y.
     """
@@ -62,8 +64,10 @@ class Sweep(Sawyer):
 class SweepInto(Sawyer):
     """Sweep into: sweep the block forward into the hole.
 
-    Reward: 2 for pinching the block, and 6 times the Hamacher product of that and the block at the target; 10 within
-        0.05 m of the target, which is at whatever height the block is.
+    Reward: with the block's distance d from the target, which is at whatever height the block is,
+            r = 10  (d below 0.05)
+            r = 2 C + 6 H(C, near(d, 0.05, d_0))  (else)
+        C is pinching with O = 0.02, W = 0.005 and X = 0.01.
     Success: the block is within 0.05 m of the target.
     Start: the block at the drawn x and y, at the height where it lay while the hand settled. The target is the hole.
     """

@@ -35,7 +35,8 @@ def _slide(self: Sawyer, at: Observables, began: Mapping[str, Array]) -> tuple[A
 class WindowOpen(Sawyer):
     """Window open: slide the window to the right by its handle.
 
-    Reward: 10 times the Hamacher product of the tool centre at the handle and the handle at the target along x.
+    Reward: with the handle o, and its distance d from the target along x,
+            r = 10 H(near(|o - t|, 0.02, ||o_0 - t_0| - 0.02|), near(d, 0.05, |d_0 - 0.05|))
     Success: the handle is within 0.05 m of the target along x.
     Start: the window at the drawn place, closed. The target is 0.2 m to the right of the window's centre.
 
@@ -63,8 +64,8 @@ class WindowOpen(Sawyer):
 class WindowClose(Sawyer):
     """Window close: slide the window to the left by its handle.
 
-    Reward: 10 times the Hamacher product of the tool centre at the handle, which falls as a Gaussian, and the handle at
-        the target along x.
+    Reward: with the handle o, and its distance d from the target along x,
+            r = 10 H(gauss(|o - t|, 0.02, ||o_0 - t_0| - 0.02|), near(d, 0.05, |d_0 - 0.05|))
     Success: the handle is within 0.05 m of the target along x.
     Start: the window at the drawn place, open by 0.2 m. The target is the window's centre.
     """
