@@ -174,6 +174,33 @@ def test_pages_of_families_name_their_reward(hooks):
         assert "**Reward**: " in page and "**Observation (" in page
 
 
+@pytest.fixture(scope="module")
+def formulas():
+    return made_of("formulas")
+
+
+def reward_told(hooks, cls):
+    """The first class of a family's page whose text tells a reward, and what it tells."""
+    texts = ((each, hooks.to_markdown(each.__doc__)) for each in (cls, *hooks._described_bases(cls)))
+    return next((each, told[0]) for each, text in texts if (told := re.search(_REWARD, text)))
+
+
+_REWARD = r"(?ms)^\*\*Reward\*\*: .*?(?=^\*\*|\Z)"
+
+
+@needs("mkdocs")
+def test_pages_of_families_have_their_reward_as_a_formula(hooks, formulas):
+    """The formula is of the class that computes the reward, or of one that goes on from there."""
+    lacking = []
+    for name, (cls, _) in ENVS.items():
+        if cls.__module__.startswith("mtjax"):
+            teller, told = reward_told(hooks, cls)
+            computes = next((each for each in cls.__mro__ if {"reward", "evaluate"} & vars(each).keys()), object)
+            if not (issubclass(teller, computes) and "<math" in formulas.on_page_markdown(told)):
+                lacking.append(name)
+    assert lacking == []
+
+
 def weight(page):
     """The bytes of a page with its pictures, styles and scripts."""
     text = page.read_text()
