@@ -143,16 +143,16 @@ class _Run:
         return programs, state
 
     def _describe(self, shapes: TrainState) -> None:
-        spec, settings = self.config.family.spec, self.config.played
-        needs = memory.Needs.of(shapes, spec, self.config.trained, settings)
+        spec, agent, settings = self.config.family.spec, self.config.trained, self.config.played
+        needs = memory.Needs.of(shapes, spec, agent, settings)
         memory.require_room(needs, spec)
-        kind = self.config.trained.experience.describe(spec, settings.num_envs)
+        kind = agent.experience.describe(spec, settings.num_envs)
         for line in memory.tell(shapes.data, needs, kind, len(self.entries.seeds)):
             self.journal.console.say(line)
         if line := meshes.describe(self.config.mesh, len(self.entries.seeds), settings.num_envs):
             self.journal.console.say(line)
         if self.hooks.directory is not None:
-            flags = [*self.config.trained.experience.storage.flags, *["host-replay-size"] * bool(needs.host)]
+            flags = [*agent.experience.storage.flags, *["host-replay-size"] * bool(needs.host)]
             checkpoint.require_space(self.hooks.directory, shapes, needs.host, flags)
 
     def _begin(self, programs: Programs, state: TrainState, steps: int) -> _Progress:
