@@ -101,17 +101,27 @@ def keep(folder: Path, agent: str, name: str, place: str) -> Path:
 
 
 def curves(agent: str, other: Path, this: Path) -> list[list[str]]:
-    """Return a line for each evaluation: mean returns on the training tasks, and differences over pairs of seeds."""
-    with np.load(other) as before, np.load(this) as after:
-        steps, before, after = after["steps"], before["train"], after["train"]  # (S, evaluations, T, episodes)
+    """Return a line for each evaluation: mean returns on the training tasks, and differences over pairs of seeds.
+
+    Checkouts may differ in how they round steps to whole chunks. Evaluations after other steps are left out.
+    """
+    before, after = (of_steps(file) for file in (other, this))
     lines = []
-    for step, ours, theirs in zip(steps, np.moveaxis(after, 1, 0), np.moveaxis(before, 1, 0), strict=True):
-        gap = paired_difference(ours, theirs)
-        shown = (
-            "the same bits" if np.array_equal(ours, theirs) else f"{gap.point:+.2f} [{gap.low:+.2f}, {gap.high:+.2f}]"
-        )
-        lines.append([agent, str(len(ours)), f"{step:,}", f"{theirs.mean():.2f}", f"{ours.mean():.2f}", shown])
-    return lines
+    for step in before.keys() & after.keys():
+        gap = paired_difference(after[step], before[step])
+        same = np.array_equal(after[step], before[step])
+        shown = "the same bits" if same else f"{gap.point:+.2f} [{gap.low:+.2f}, {gap.high:+.2f}]"
+        means = [f"{x[step].mean():.2f}" for x in (before, after)]
+        lines.append([agent, str(len(after[step])), f"{step:,}", *means, shown])
+    if not lines:
+        raise SystemExit(f"no evaluation of {agent} came after as many steps in both; give --steps of whole chunks")
+    return sorted(lines, key=lambda line: int(line[2].replace(",", "")))
+
+
+def of_steps(file: Path) -> dict[int, np.ndarray]:
+    """Return the returns (S, T, episodes) on the training tasks of every evaluation, by its steps."""
+    with np.load(file) as found:
+        return dict(zip(found["steps"].tolist(), np.moveaxis(found["train"], 1, 0), strict=True))
 
 
 def row(agent: str, seeds: int, name: str, timings: list[Timing]) -> dict:
