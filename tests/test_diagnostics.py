@@ -496,6 +496,7 @@ def test_program_plays_a_rollout_of_an_agent_without_a_replay(short_family, tmp_
     assert f"{found['td_error'][1]:.3g}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_seeds_are_averaged(finished_run):
     """By the same keys for every seed, whichever others are there."""
     policy, (replay, batch_size) = mtjax.load(finished_run), load_experience(finished_run)

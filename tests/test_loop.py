@@ -270,6 +270,7 @@ def test_the_same_seed_gives_the_same_bytes():
     assert sum(differs) > 10
 
 
+@pytest.mark.slow
 def test_the_agent_rests_through_the_warmup():
     """Its state is what it began with, to the bit, until learning starts."""
     start, _ = learn((3,), chunks=0)

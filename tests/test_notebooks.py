@@ -8,6 +8,8 @@ import pytest
 from needs import require
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+LONG = ("ablation", "own_encoder")  # they take a minute each
+RUN = [pytest.param(x, marks=pytest.mark.nightly if x.stem in LONG else pytest.mark.slow) for x in NOTEBOOKS]
 LARGEST = 200_000  # bytes, pictures included
 
 
@@ -26,8 +28,7 @@ def test_notebook_shows_its_results(path):
     assert path.stat().st_size < LARGEST
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", RUN, ids=lambda path: path.stem)
 @pytest.mark.filterwarnings("ignore")  # the kernel's own machinery, in this process, is not ours
 def test_notebook_runs(path, monkeypatch):
     """Every cell executes as it stands, the check of the conclusion too."""

@@ -754,6 +754,7 @@ def test_there_are_ten_evaluations_unless_told(plan, every):
     assert plan.interval == every
 
 
+@pytest.mark.slow
 def test_steps_are_rounded_up_to_whole_chunks(play):
     """A run never falls short of what was asked, and its chunks are equal and no longer than they need be."""
     assert [row["steps"] for row in play(None, steps=101).rows] == [52, 52, 104, 104]

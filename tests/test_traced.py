@@ -118,6 +118,7 @@ def same(one, other):
     return equal and jax.tree.structure(one) == jax.tree.structure(other)
 
 
+@pytest.mark.slow
 def test_a_program_is_traced_once(folder, times, monkeypatch):
     """What the file gives back is the program: values, containers and keys. No pickle is loaded."""
     first = run(times)

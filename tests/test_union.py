@@ -29,6 +29,7 @@ from mtjax.types import Acted, InputError
 ATOL = 2e-5
 APART = 5.0  # [m] at least, between a parked thing and anything else
 MT10 = tuple(name.removeprefix("metaworld-") for name in BENCHMARKS["mt10"][1])
+NIGHTLY = pytest.mark.nightly  # half a minute
 small_and_large = pytest.mark.parametrize(
     "names", [pytest.param(MT10, id="mt10"), pytest.param(tuple(TASKS), id="mt50", marks=pytest.mark.slow)]
 )
@@ -131,7 +132,7 @@ def test_scenes_is_a_setting_of_mixtures(tmp_path):
 
 
 @needs("metaworld")
-@small_and_large
+@pytest.mark.parametrize("names", [pytest.param(MT10, id="mt10"), pytest.param(tuple(TASKS), id="mt50", marks=NIGHTLY)])
 def test_a_step_is_that_of_the_own_scene(names, count=24):
     """From recorded states of scripted play, with both goals: all that worlds hold, observation, reward and success."""
     env, tasks, records = recorded(names)
@@ -201,6 +202,7 @@ def require_parked(model, data, used):
 
 
 @needs("metaworld")
+@pytest.mark.slow
 def test_held_out_tasks_step_in_the_union_as_alone():
     """A split has tasks of some families, in a union with others."""
     names, held_out = ("push", "door-open", "drawer-close", "window-open"), ("door-open", "window-open")
@@ -225,6 +227,7 @@ class Waving:
 
 
 @needs("metaworld")
+@pytest.mark.slow
 def test_episodes_begin_anew_in_the_union_as_in_joined_scenes(steps=4, worlds=3):
     """Goals differ between worlds, and every world's episode ends once, each at another step."""
     found, agent, learners = [], Waving(), jnp.zeros(1)

@@ -36,6 +36,7 @@ def both_ends(made, state, batch, key):
     return np.concatenate([np.concatenate(end, axis=-1) for end in ends], axis=1)
 
 
+@pytest.mark.slow
 def test_targets_are_normalised_by_both_ends_of_the_batch_and_not_by_running_statistics():
     """So they depend on the rest of the batch, and not on what the target critics have seen before."""
     made, state, _ = started()
