@@ -584,9 +584,9 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     config = configured(start.env, start.agent, SMALL, plan={"seeds": 3}, start=start, sweep=sweep)
     run = _Run(config, Hooks(start=start, quiet=True))
     seeds, numbers = run.entries.axis
-    shapes = jax.eval_shape(lambda: loop.init(start.env, run.agent, config.training, tasks, seeds, numbers)).agent
+    shapes = jax.eval_shape(lambda: loop.init(start.env, config.trained, config.training, tasks, seeds, numbers)).agent
     fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)._replace(numbers=numbers)
-    state = adopted(config, run.hooks, run.agent, fresh)
+    state = adopted(config, run.hooks, config.trained, fresh)
     np.testing.assert_array_equal(state.numbers["tau"], np.float32([0.1] * 3 + [0.2] * 3))
     began = np.asarray(start.states.nets["temperature"].own["log"])
     taken = state.nets["temperature"].own["log"]
