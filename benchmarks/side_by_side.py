@@ -107,7 +107,7 @@ def curves(agent: str, other: Path, this: Path) -> list[list[str]]:
     """
     before, after = (of_steps(file) for file in (other, this))
     lines = []
-    for step in before.keys() & after.keys():
+    for step in sorted(before.keys() & after.keys()):
         gap = paired_difference(after[step], before[step])
         same = np.array_equal(after[step], before[step])
         shown = "the same bits" if same else f"{gap.point:+.2f} [{gap.low:+.2f}, {gap.high:+.2f}]"
@@ -115,7 +115,7 @@ def curves(agent: str, other: Path, this: Path) -> list[list[str]]:
         lines.append([agent, str(len(after[step])), f"{step:,}", *means, shown])
     if not lines:
         raise SystemExit(f"no evaluation of {agent} came after as many steps in both; give --steps of whole chunks")
-    return sorted(lines, key=lambda line: int(line[2].replace(",", "")))
+    return lines
 
 
 def of_steps(file: Path) -> dict[int, np.ndarray]:

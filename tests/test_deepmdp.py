@@ -319,19 +319,16 @@ def test_the_actor_does_not_move_the_critics_parameters():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings"),
-    one_in(
-        4,
-        [
-            ("deepmdp", {}),
-            ("deepmdp", {"conditioning": "inferred", "inferred_from": 2}),
-            ("hip-bmdp", {"transition": "probabilistic", **INFERRED}),
-            ("hip-bmdp", {"heads": "disjoint", "value": "c51"}),
-        ],
-    ),
+    [
+        ("deepmdp", {}),
+        ("deepmdp", {"conditioning": "inferred", "inferred_from": 2}),
+        ("hip-bmdp", {"transition": "probabilistic", **INFERRED}),
+        ("hip-bmdp", {"heads": "disjoint", "value": "c51"}),
+    ],
 )
-@pytest.mark.slow
 def test_everything_that_should_learn_does(name, settings):
     """After ten updates no leaf is where it began, nor any task's part of it, and shapes are as they were."""
     agent = make(name, **settings)

@@ -53,7 +53,11 @@ VARIED = {
 DOMAINS, SLOW = list(VARIED), pytest.mark.slow
 # MJX takes ten seconds to compile a domain with contact.
 QUICK_DOMAINS = ("pendulum-swingup",)
-LONG = ("humanoid-walk", "swimmer-swimmer6", "finger-turn-easy")  # to compile by MJX, or as another's
+LONG = (
+    "humanoid-walk",
+    "swimmer-swimmer6",
+    "finger-turn-easy",
+)  # MJX compiles two of them for long; the third is a finger too
 ALIKE = [name for name in DOMAINS if name != "dog-walk"]  # MJX and Warp step another dog: tests/test_bodies.py
 HEAVY = ("dog-walk", "humanoid-walk")  # whose play takes seconds
 # Bounds on each world's largest error in velocity, by quantile, relative to the domain's fastest velocity. MJX and Warp

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import family_for, slow_but, tiny
+from probes import family_for, tiny
 from test_export import ENV, observations, policy_of
 
 import mtjax
@@ -25,8 +25,8 @@ from mtjax.types import InputError
 PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
 
 
-@pytest.mark.parametrize("name", slow_but([x for x in agents.AGENTS if family_for(x) == "finger-spin"], "care"))
 @pytest.mark.slow
+@pytest.mark.parametrize("name", [x for x in agents.AGENTS if family_for(x) == "finger-spin"])
 def test_an_action_depends_on_what_is_kept_alone(name):
     """Whatever the other arrays of the state hold."""
     policy = policy_of(tiny(name))

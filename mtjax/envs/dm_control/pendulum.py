@@ -81,8 +81,8 @@ class PendulumSwingup(Domain):
 class PendulumSpin(PendulumSwingup):
     """Spin: turn the pole round and round at 6 rad/s or faster.
 
-    As PendulumSwingup, but for the reward. The motor can keep up a mean of some 8 rad/s, of which a turn takes 2 away
-    at the top. Not a task of dm_control: it has the same model, starts and episodes.
+    As PendulumSwingup, but for the reward. The motor can keep up a mean of some 8 rad/s. The pole is slower than
+    that by 2 rad/s at the top. Not a task of dm_control: it has the same model, starts and episodes.
 
     Reward: with the pole's velocity omega in the hinge's positive sense [rad/s],
             r = clip(omega / speed, 0, 1)
