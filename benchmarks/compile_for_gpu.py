@@ -30,7 +30,7 @@ import jax
 from jax.experimental import topologies
 from jax.sharding import NamedSharding, PartitionSpec
 from report import markdown, publish, run_main
-from update_cost import AGENTS, random_batch, seeing, tasks_of, updates
+from update_cost import AGENTS, random_window, seeing, tasks_of, updates
 
 import mtjax
 from mtjax.types import InputError
@@ -102,15 +102,15 @@ def measure(name: str, arguments: argparse.Namespace, place: NamedSharding) -> d
     """Compile two updates in a scan, for all seeds."""
     agent, tasks = mtjax.agent(name, hidden=arguments.hidden), tasks_of(arguments.tasks)
     spec = seeing(arguments.pictures)
-    batch = random_batch(spec, arguments.tasks, arguments.batch)
+    window = random_window(spec, arguments.tasks, arguments.batch)
     seeds = jax.numpy.arange(arguments.seeds, dtype=jax.numpy.uint32)
     state = jax.eval_shape(jax.vmap(lambda seed: agent.init(spec, tasks, jax.random.key(seed))), seeds)
 
-    def learn(state: Any, seeds: Any, batch: Any, tasks: Any) -> Any:
-        return updates(agent, tasks, batch, 2)(state, jax.vmap(jax.random.key)(seeds))
+    def learn(state: Any, seeds: Any, window: Any, tasks: Any) -> Any:
+        return updates(agent, tasks, window, 2)(state, jax.vmap(jax.random.key)(seeds))
 
     there = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)
-    given = jax.tree.map(there, (state, seeds, batch, tasks))
+    given = jax.tree.map(there, (state, seeds, window, tasks))
     lowered = jax.jit(learn, out_shardings=place).trace(*given).lower(lowering_platforms=("cuda",))
     before = time.perf_counter()
     text = lowered.compile().as_text() or ""

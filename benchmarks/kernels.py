@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from report import markdown, publish, run_main
-from update_cost import SPEC, Contestant, random_batch, tasks_of
+from update_cost import SPEC, Contestant, random_window, tasks_of
 
 import mtjax
 
@@ -126,9 +126,8 @@ def row(name: str, arguments: argparse.Namespace, operations: list[Operation], s
 def count_flops(name: str, arguments: argparse.Namespace) -> float:
     """Return XLA's count of floating-point operations in one update of all seeds."""
     agent = mtjax.agent(name, hidden=arguments.hidden)
-    tasks, batch = tasks_of(arguments.tasks), random_batch(SPEC, arguments.tasks, arguments.batch)
+    tasks, window = tasks_of(arguments.tasks), random_window(SPEC, arguments.tasks, arguments.batch)
     state = jax.eval_shape(lambda: agent.init(SPEC, tasks, jax.random.key(0)))
-    window = jax.tree.map(lambda x: jnp.expand_dims(x, 2), batch)  # of one step
     update = jax.jit(lambda state, key: agent.update(state, window, tasks, key, jnp.int32(0)))
     key = jax.eval_shape(lambda: jax.random.key(0))
     found = update.lower(state, key).compile().cost_analysis()

@@ -140,9 +140,14 @@ def run(root: Path, flags: list[str], runs: Path, cache: Path) -> Timing:
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)} failed in {root}:\n{done.stderr[-2000:]}")
-    told = re.search(r"compiled in ([\d.]+) s", done.stdout)
     (file,) = runs.glob("*/metrics.csv")
-    return Timing(milliseconds(file), float(told[1]) if told else float("nan"))
+    return Timing(milliseconds(file), seconds_of_compiling(done.stdout))
+
+
+def seconds_of_compiling(output: str) -> float:
+    """Return what a run tells of the time that it compiled for, such as 41 s or 1 min 3 s."""
+    told = re.search(r"compiled in (?:(\d+) min )?([\d.]+) s", output)
+    return 60 * float(told[1] or 0) + float(told[2]) if told else float("nan")
 
 
 def milliseconds(file: Path) -> float:

@@ -52,18 +52,18 @@ def compare(name: str) -> dict[str, Any]:
     compiled, compile_seconds = {}, {}
     for form, (learner, state) in states.items():
 
-        def update(state, batch, key, learner=learner):
-            step = lambda state, key: (learner.update(state, batch, tasks, key)[0], None)
+        def update(state, window, key, learner=learner):
+            step = lambda state, key: (learner.update(state, window, tasks, key, jnp.int32(0))[0], None)
             return jax.lax.scan(step, state, jax.random.split(key, UPDATES))[0]
 
-        lowered, before = jax.jit(update).lower(state, random_batch(), key), time.perf_counter()
+        lowered, before = jax.jit(update).lower(state, random_window(), key), time.perf_counter()
         compiled[form] = lowered.compile()
         compile_seconds[form] = time.perf_counter() - before
     seconds = {form: [] for form in states}
     for _ in range(ROUNDS + 1):
         for form, (_, state) in states.items():
             before = time.perf_counter()
-            jax.block_until_ready(compiled[form](state, random_batch(), key))
+            jax.block_until_ready(compiled[form](state, random_window(), key))
             seconds[form].append((time.perf_counter() - before) / UPDATES)
     each = {form: [1e3 * x for x in times[1:]] for form, times in seconds.items()}
     return {
@@ -75,11 +75,11 @@ def compare(name: str) -> dict[str, Any]:
     }
 
 
-def random_batch() -> Transition:
-    """Draw a batch (T, B, ...) of transitions."""
+def random_window() -> Transition:
+    """Draw windows (T, B, 1, ...) of one step."""
     random = np.random.default_rng(0)
-    normal = lambda *size: jnp.float32(random.normal(size=(TASKS, BATCH, *size)))
-    return Transition(normal(9), jnp.tanh(normal(2)), normal(), jnp.ones((TASKS, BATCH)), normal(9))
+    normal = lambda *size: jnp.float32(random.normal(size=(TASKS, BATCH, 1, *size)))
+    return Transition(normal(9), jnp.tanh(normal(2)), normal(), jnp.ones((TASKS, BATCH, 1)), normal(9))
 
 
 if __name__ == "__main__":

@@ -72,12 +72,12 @@ class Contestant:
         self.num_tasks, self.num_seeds = num_tasks, num_seeds
         agent = mtjax.agent(name, hidden=arguments.hidden)
         tasks, keys = tasks_of(num_tasks), jax.random.split(jax.random.key(0), num_seeds)
-        batch = random_batch(spec, num_tasks, arguments.batch)
+        window = random_window(spec, num_tasks, arguments.batch)
         self.state = jax.jit(jax.vmap(lambda key: agent.init(spec, tasks, key)))(keys)
         networks = [self.state.nets[net] for net in ("actor", "critic", "representation", "knowing")]
         self.num_parameters = size_of(networks) // num_seeds
 
-        self.learn = updates(agent, tasks, batch, arguments.updates)
+        self.learn = updates(agent, tasks, window, arguments.updates)
         before = time.perf_counter()
         self.run = jax.jit(self.learn, donate_argnums=0).lower(self.state, keys).compile()
         self.compile_seconds, self.keys = time.perf_counter() - before, keys
@@ -104,9 +104,9 @@ class Contestant:
         }
 
 
-def updates(agent: Any, tasks: Task, batch: Transition, count: int) -> Callable:
+def updates(agent: Any, tasks: Task, window: Transition, count: int) -> Callable:
     """Return a function of states (S, ...) and keys (S,), which makes so many updates of every seed in a scan."""
-    update = lambda state, key: agent.update(state, batch, tasks, key)
+    update = lambda state, key: agent.update(state, window, tasks, key, jnp.int32(0))
     return over_seeds(lambda state, key: jax.lax.scan(update, state, jax.random.split(key, count))[0], 0, 0)
 
 
@@ -123,15 +123,16 @@ def seeing(side: int | None) -> Spec:
     return SPEC._replace(obs={frames.PICTURES: jax.ShapeDtypeStruct((side, side, 3), jnp.uint8)}, frames=3)
 
 
-def random_batch(spec: Spec, num_tasks: int, batch_size: int) -> Transition:
-    random, lead = np.random.default_rng(0), (num_tasks, batch_size)
+def random_window(spec: Spec, num_tasks: int, batch_size: int) -> Transition:
+    """Draw windows (T, B, 1, ...) of one step."""
+    random, lead = np.random.default_rng(0), (num_tasks, batch_size, 1)
     normal = lambda *shape: jnp.float32(random.normal(size=(*lead, *shape)))
     draw = lambda x: (
         jnp.uint8(random.integers(256, size=(*lead, *x.shape))) if x.dtype == jnp.uint8 else normal(*x.shape)
     )
     observe = lambda: jax.tree.map(draw, frames.seen(spec))
     obs, action, next_obs = observe(), jnp.tanh(normal(spec.action_size)), observe()
-    return Transition(obs, action, normal(), jnp.ones((num_tasks, batch_size)), next_obs)
+    return Transition(obs, action, normal(), jnp.ones(lead), next_obs)
 
 
 def size_of(tree: Any) -> int:

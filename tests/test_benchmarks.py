@@ -26,7 +26,7 @@ from mtjax.envs.metaworld.names import TASKS
 from mtjax.learning.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.saved.log import append_rows
 from mtjax.saved.records import Records
-from mtjax.training.console import Console
+from mtjax.training.console import Console, duration
 from mtjax.types import InputError
 
 _OF_META_WORLD = ("physics", "steps_per_second", "metaworld_policies")
@@ -733,3 +733,17 @@ def test_an_interrupted_benchmark_ends_without_a_traceback(script, capsys):
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
         script("report").run_main(main)
     assert getattr(stop.value, "code", None) == 130 and capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("seconds", [3.6, 41.0, 63.0])
+def test_seconds_of_compiling_are_read_as_a_run_tells_them(script, seconds):
+    told = f"compiling\ncompiled in {duration(seconds)}\n"
+    assert script("side_by_side").seconds_of_compiling(told) == seconds
+
+
+@pytest.mark.slow
+def test_updates_are_timed_as_the_loop_makes_them(script, monkeypatch, capsys):
+    flags = ["--agents", "sac", "care", "--tasks", "2", "--batch", "4", "--hidden", "8", "--repeats", "1"]
+    monkeypatch.setattr(sys, "argv", ["update_cost.py", *flags])
+    script("update_cost").main()
+    assert [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[2:4]] == ["| sac", "| care"]

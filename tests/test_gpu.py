@@ -524,7 +524,8 @@ def test_worlds_outside_of_jax_take_each_step_once(count=64, steps=20):
 
     with on("cpu"):
         keys = jax.random.split(jax.random.key(0), (1, 1, count))
-    jax.tree.map(np.testing.assert_array_equal, *both(play, env.tasks(), keys))
+    tasks = rollout.broadcast_tasks(env.tasks(), keys.shape)
+    jax.tree.map(np.testing.assert_array_equal, *both(play, tasks, keys))
 
 
 @pytest.mark.parametrize("name", ["finger-spin-vary-size", "walker-walk-vary-friction"])
