@@ -43,7 +43,7 @@ _PULLS = "ten pulls earn between 5 and 6.02, too little to see in few trials; te
 _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beliefs that are known"
 _STORED = "takes over ten minutes of two CPU cores; tests/test_recurrent.py has burn-in step by step"
 _SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
-_ON = "its success is not measured yet; tests/test_tabletop.py plays such worlds"
+_ON = "minutes of a GPU, by benchmarks/resets.py; tests/test_tabletop.py plays such worlds"
 _CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _PAGE = "is --quick with a page; tests/test_view.py has a run with one"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command

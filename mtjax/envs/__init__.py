@@ -241,6 +241,11 @@ _ANALYTIC: dict[str, Entry] = {
     "trading": ("trading:Trading", {"vary": {"risk-aversion": "0.5:5:10"}}),
 }
 
+# Hands. The goals of ``claw`` are within what a few pushes turn.
+_DEXTEROUS: dict[str, Entry] = {
+    "claw": ("claw:Claw", {"vary": {"goal": "-2,-1,1,2"}, "split": "none", "num_tasks": 1}),
+}
+
 _BRAX_NAMES = (
     "ant",
     "fast",
@@ -269,6 +274,7 @@ ENVS = Families(
     | _inside("mtjax.envs.mtenv", _MTENV)
     | _inside("mtjax.envs.analytic", _ANALYTIC)
     | _inside("mtjax.envs.corridors", _CORRIDORS)
+    | _inside("mtjax.envs.dexterous", _DEXTEROUS)
     | _inside("mtjax.envs.craft", _CRAFT)
     | _inside("mtjax.envs.metaworld", FAMILIES)
     | _inside("mtjax.envs", _BRAX | _HIDDEN)

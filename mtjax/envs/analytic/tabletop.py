@@ -14,7 +14,7 @@ from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, positive
 from mtjax.envs.pixels import Mark, Pictured
-from mtjax.envs.variation import Variation
+from mtjax.envs.variation import Variation, drawn_in_episodes
 from mtjax.names import nearest_error
 from mtjax.types import Array, Key, Step, Task, Transition
 
@@ -109,10 +109,7 @@ class Tabletop(Pictured, Family):
     @cached_property
     def variation(self) -> Variation:
         """Return the values of the only training task, and as its draws those of all that are listed."""
-        listed = Family.variation.func(self)  # type: ignore
-        rows = listed.rows["train"]
-        draws = rows if listed.draws is None else listed.draws.reshape(-1, len(listed.names))
-        return dataclasses.replace(listed, rows={**listed.rows, "train": rows[:1]}, draws=draws[None])
+        return drawn_in_episodes(Family.variation.func(self))  # type: ignore
 
     def reset(self, task: Task, key: Key) -> Step:
         moved = jax.random.uniform(key, (2, 2), jnp.float32, -_SCATTER, _SCATTER)

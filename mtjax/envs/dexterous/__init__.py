@@ -1,0 +1,1 @@
+"""Families whose bodies are hands."""
