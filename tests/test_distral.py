@@ -17,6 +17,7 @@ from mtjax.agents.distral import Distral
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.parts.policies import Gaussian
+from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.replay_batches import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import axes_of
@@ -391,3 +392,26 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     """With what is allowed."""
     with pytest.raises(InputError, match=message):
         agent("distral", **settings)
+
+
+# With PopArt.
+
+
+def test_with_popart_an_update_is_the_same_for_rewards_of_any_scale():
+    """In each task's units: temperature and divergence are weighed in them too. Only the units are as many times."""
+    scales, made = jnp.float32([0.01, 1.0, 100.0]), tiny("distral", scaling="popart", target_rate=0.1)
+    init, update = learner(made, TASKS, BATCH, SPEC)
+    begun, steps = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
+
+    def after(by):
+        units = Moments(by * jnp.float32([0.3, -0.1, 0.2]), jnp.square(by) * jnp.float32([0.5, 1.5, 1.0]))
+        before = with_nets(begun, scaling=Params({}, units))
+        return update(before, steps._replace(reward=steps.reward * by[:, None]), TASKS, KEY)[0]
+
+    plain, scaled = after(jnp.ones(3)), after(scales)
+    for name in ("actor", "critic", "temperature"):
+        for x, y in zip(leaves(plain.nets[name]), leaves(scaled.nets[name]), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-5)
+    old, new = (x.nets["scaling"].own for x in (plain, scaled))
+    np.testing.assert_allclose(new.mean, scales * old.mean, rtol=1e-4)
+    np.testing.assert_allclose(new.variance, jnp.square(scales) * old.variance, rtol=1e-4)

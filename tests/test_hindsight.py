@@ -22,10 +22,12 @@ from mtjax.types import InputError, Transition
 WORLDS = 256
 KEY = jax.random.key(4)
 STRAIGHT = {"target-radius": "0.1,0.2"}
+SCALED = {"goal-x": "-0.1,0.2", "reward-scale": "1,3"}
 # Family, settings, steps to take before the one that is relabelled, and whether observations show the goal.
 FAMILIES = {
     "point-mass": ("point-mass-vary-goal", {"combine": "grid", "vary": {"goal-x": "-0.1,0.2", "goal-y": "0,0.1"}}, 3),
     "point-mass-easy": ("point-mass-easy", {"vary": {"goal-x": "-0.1,0.2"}}, 3),
+    "point-mass-scale": ("point-mass-vary-goal", {"combine": "paired", "vary": SCALED}, 3),
     "reacher-target": ("reacher-vary-goal", {"vary": {"target-angle": "-1,2", **STRAIGHT}}, 3),
     "reacher": ("reacher-easy", {"vary": {"target-size": "0.1,0.15"}}, 3),
     "cheetah-speed": ("cheetah-run-vary-speed", {"vary": {"speed": "1,3"}}, 10),

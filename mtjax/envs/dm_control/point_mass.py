@@ -69,7 +69,7 @@ class PointMass(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
-    relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y")
+    relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y", "reward-scale")
     look: ClassVar = Look((0, 0, 0.75), 0, light=(0, 0, 1))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
