@@ -44,8 +44,8 @@ AGENTS: dict[str, tuple[str, dict[str, Any]]] = {
     "impala-clipped": ("impala", {"value_normalization": "none", "reward_clip": 1.0}),
     "impala-popart": ("impala", {"value_normalization": "popart"}),
     "distral": ("distral", {"scaling": "none"}),
-    # The published rate of the estimates, 3e-4, is one of long runs: units of 0.01 would need some 30,000 updates.
-    "distral-popart": ("distral", {"scaling": "popart", "target_rate": 0.05}),
+    # The published rate of the estimates, 3e-4, is one of longer runs.
+    "distral-popart": ("distral", {"scaling": "popart", "target_rate": 0.01}),
 }
 CONTROL = "control"
 _ANGLES = [2 * math.pi * i / 3 for i in range(3)]

@@ -123,8 +123,8 @@ class RunConfig:
     search_batch: int = 0
     """Trials of a round. 0 means a quarter of all."""
     search_rungs: int = 3
-    """How often a round is judged, the last time at its end, and before it after half of the steps, a quarter and so
-    on. With 3 it takes half of the steps of as many runs, with 5 and a round of 16 or more a fifth; 1 halves nothing."""
+    """How often a round is judged: at its end, and before it after half of the steps, a quarter and so on. With 3 it
+    takes half of the steps of as many runs, with 5 and 16 trials or more a fifth; with 1 all go to the end."""
     quick: bool = False
     """Learn something in some 35 seconds of processor time: a point mass reaches ten goals. Other flags change it."""
     config: str = ""

@@ -17,7 +17,6 @@ from mtjax.agents.distral import Distral
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.gradients.descent import descend
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.replay_batches import Batch
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import axes_of
@@ -398,15 +397,15 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 
 
 def test_with_popart_an_update_is_the_same_for_rewards_of_any_scale():
-    """In each task's units: temperature and divergence are weighed in them too. Only the units are as many times."""
+    """From the first one on, as the first units are those of rewards before it; temperatures are in these units."""
     scales, made = jnp.float32([0.01, 1.0, 100.0]), tiny("distral", scaling="popart", target_rate=0.1)
     init, update = learner(made, TASKS, BATCH, SPEC)
     begun, steps = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
 
     def after(by):
-        units = Moments(by * jnp.float32([0.3, -0.1, 0.2]), jnp.square(by) * jnp.float32([0.5, 1.5, 1.0]))
-        before = with_nets(begun, scaling=Params({}, units))
-        return update(before, steps._replace(reward=steps.reward * by[:, None]), TASKS, KEY)[0]
+        window = steps._replace(reward=steps.reward * by[:, None])
+        units = made.scaling.observe(begun.nets["scaling"].own, window)
+        return update(with_nets(begun, scaling=Params({}, units)), window, TASKS, KEY)[0]
 
     plain, scaled = after(jnp.ones(3)), after(scales)
     for name in ("actor", "critic", "temperature"):

@@ -282,4 +282,5 @@ def _conclusion(search: Search, folder: Path, imports: Sequence[str]) -> list[st
         told = f"the preset, trial {first.number}: {amount(searching.last_return(first))}, {first.state}. {told}"
     whole, share = len(search.trials) * search.rungs[-1], searching.taken(search)
     steps = f"trials took {share:,} steps a seed, {share / whole:.0%} of the {whole:,} that all to the end take"
-    return [steps, f"best: trial {best.number}. {told}", f"  {again}", f"score it: {shlex.join(point)}", f"search: {folder}"]
+    chosen = [f"best: trial {best.number}. {told}", f"  {again}", f"score it: {shlex.join(point)}"]
+    return [steps, *chosen, f"search: {folder}"]
