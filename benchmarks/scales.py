@@ -177,15 +177,17 @@ def table(out: Path) -> str:
 def lines(found: dict[str, Any], agent: str) -> Iterator[list[str]]:
     """Return an agent's lines of the table, one for each scale."""
     result, control = found[agent], found.get(f"{agent}-{CONTROL}")
-    alone = None if control is None else scores_of(control)
     for task, scale in enumerate(result["scales"]):
-        cells = []
-        for i, score in enumerate(scores_of(result)):
-            own, against = score[:, task], None if alone is None else alone[i][:, task]
-            known = against is not None and len(against) == len(own)
-            cells += [cell(stats.seed_interval(own), ".1f")]
-            cells += [cell(stats.paired_difference(own, against), "+.1f") if known else "-"]
+        pairs = zip(scores_of(result), scores_of(control) if control else (None, None), strict=True)
+        cells = [x for own, alone in pairs for x in compared(own[:, task], None if alone is None else alone[:, task])]
         yield [f"`{agent}`", f"{scale:g}", *cells, f"{result['wall_seconds']:.0f}"]
+
+
+def compared(own: np.ndarray, alone: np.ndarray | None) -> list[str]:
+    """Return the cells of scores (S,), and of what they have less than the control's, if it has as many seeds."""
+    known = alone is not None and len(alone) == len(own)
+    against = cell(stats.paired_difference(own, alone), "+.1f") if known else "-"  # type: ignore
+    return [cell(stats.seed_interval(own), ".1f"), against]
 
 
 def scores_of(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
