@@ -92,6 +92,20 @@ def test_a_relabelled_step_is_that_of_the_other_task(name):
     assert np.any(np.abs(relabelled.next_obs - after.obs) > 1e-3) == (name in SHOWN)
 
 
+@pytest.mark.parametrize("name", ["point-mass-easy", "point-mass-vary-goal"])
+def test_a_scale_multiplies_rewards_alone(name):
+    """Of the same worlds under the same actions."""
+    env = make(name, vary={"reward-scale": "0.01,1,100"}, combine="grid", split="none", engine="c")
+    keys, action = jax.random.split(KEY, WORLDS), jnp.full((WORLDS, 2), 0.3)
+    tasks, programs = env.tasks(), compiled(env)
+    starts = [programs.reset(alike(tasks, i), keys) for i in range(3)]
+    found = [programs.step(alike(tasks, i), begun.state, action) for i, begun in enumerate(starts)]
+    for i, scale in enumerate((0.01, 1, 100)):
+        np.testing.assert_allclose(found[i].reward, scale * found[1].reward, rtol=1e-5)
+        np.testing.assert_array_equal(found[i].obs, found[1].obs)
+    assert np.any(np.asarray(found[1].reward) > 1e-3)
+
+
 @pytest.mark.parametrize("name", ["point-mass", "reacher"])
 def test_a_relabelled_past_is_that_of_the_other_task(name):
     """Past rewards and observations too: the same actions from the same start, under the other goal all along."""
