@@ -118,10 +118,13 @@ class RunConfig:
     teacher: Annotated[Any, tyro.conf.Suppress] = None
     search: int = 0
     """Look for good real numbers of the agent in so many trials. Ranges are flags such as --agent.actor-lr=1e-5..1e-2.
-    A round of trials trains as one program, of which the better half goes on after a quarter and after half of the
-    steps (pip install 'mtjax[search]'). The search's folder holds a table of all trials; --resume takes this folder."""
+    A round of trials trains as one program, of which the better half goes on at each of --search-rungs (pip install
+    'mtjax[search]'). The search's folder holds a table of all trials; --resume takes this folder."""
     search_batch: int = 0
     """Trials of a round. 0 means a quarter of all."""
+    search_rungs: int = 3
+    """How often a round is judged: at its end, and before it after half of the steps, a quarter and so on. With 3 it
+    takes half of the steps of as many runs, with 5 and 16 trials or more a fifth; with 1 all go to the end."""
     quick: bool = False
     """Learn something in some 35 seconds of processor time: a point mass reaches ten goals. Other flags change it."""
     config: str = ""

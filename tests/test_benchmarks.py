@@ -747,3 +747,33 @@ def test_updates_are_timed_as_the_loop_makes_them(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["update_cost.py", *flags])
     script("update_cost").main()
     assert [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[2:4]] == ["| sac", "| care"]
+
+
+# Scales and halving.
+
+
+def test_scores_of_scales_are_beside_their_controls(script, tmp_path):
+    """A line for each agent and scale: the last and the mean return, and the same less those of the control's seeds."""
+    random = np.random.default_rng(0)
+    alone = random.uniform(size=(4, 5, 3))  # (S, V, T)
+    found = {"agent": "impala", "scales": [0.01, 1.0, 100.0], "wall_seconds": 7}
+    for name, returns in (("impala", alone + np.array([3, 0, -2])), ("impala-control", alone)):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**found, "returns": returns.tolist()}))
+    cells = [line.split(" | ") for line in script("scales").table(tmp_path).splitlines()[2:]]
+    assert [line[1] for line in cells] == ["0.01", "1", "100"]
+    assert [line[3] for line in cells] == [line[5] for line in cells]
+    assert [line[5].split()[0] for line in cells] == ["+3.0", "+0.0", "-2.0"]
+    assert cells[1][2].split()[0] == f"{alone[:, -1, 1].mean():.1f}"
+    assert cells[1][4].split()[0] == f"{alone[:, :, 1].mean():.1f}"
+
+
+def test_halving_is_compared_on_the_same_trials(script):
+    """The rank of what it found among all that went to the end, one that diverged among them; or a refusal."""
+    trial = lambda lr, *returns: {"values": {"lr": lr}, "returns": dict(zip("abc", returns, strict=False))}
+    about = {"number": 0, "wall_seconds": 2}
+    whole = {**about, "steps_taken": 400, "trials": [trial(1, 3.0), trial(2, 9.0), trial(3, 8.0), trial(4)]}
+    halved = {**about, "steps_taken": 100, "best": 2, "trials": [trial(1, 1.0), trial(2, 2.0), trial(3, 4.0, 8.0)]}
+    with pytest.raises(InputError, match="other trials"):
+        script("halving").compared(whole, halved)
+    halved["trials"].append(trial(4))
+    assert script("halving").compared(whole, halved) == [9.0, 8.0, 2, 0.25, 2, 2]

@@ -391,3 +391,26 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
     """With what is allowed."""
     with pytest.raises(InputError, match=message):
         agent("distral", **settings)
+
+
+# With PopArt.
+
+
+def test_with_popart_an_update_is_the_same_for_rewards_of_any_scale():
+    """From the first one on, as the first units are those of rewards before it; temperatures are in these units."""
+    scales, made = jnp.float32([0.01, 1.0, 100.0]), tiny("distral", scaling="popart", target_rate=0.1)
+    init, update = learner(made, TASKS, BATCH, SPEC)
+    begun, steps = init(TASKS, KEY), random_batch(0, 3, BATCH, SPEC)
+
+    def after(by):
+        window = steps._replace(reward=steps.reward * by[:, None])
+        units = made.scaling.observe(begun.nets["scaling"].own, window)
+        return update(with_nets(begun, scaling=Params({}, units)), window, TASKS, KEY)[0]
+
+    plain, scaled = after(jnp.ones(3)), after(scales)
+    for name in ("actor", "critic", "temperature"):
+        for x, y in zip(leaves(plain.nets[name]), leaves(scaled.nets[name]), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-5)
+    old, new = (x.nets["scaling"].own for x in (plain, scaled))
+    np.testing.assert_allclose(new.mean, scales * old.mean, rtol=1e-4)
+    np.testing.assert_allclose(new.variance, jnp.square(scales) * old.variance, rtol=1e-4)

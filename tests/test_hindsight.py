@@ -22,10 +22,12 @@ from mtjax.types import InputError, Transition
 WORLDS = 256
 KEY = jax.random.key(4)
 STRAIGHT = {"target-radius": "0.1,0.2"}
+SCALED = {"goal-x": "-0.1,0.2", "reward-scale": "1,3"}
 # Family, settings, steps to take before the one that is relabelled, and whether observations show the goal.
 FAMILIES = {
     "point-mass": ("point-mass-vary-goal", {"combine": "grid", "vary": {"goal-x": "-0.1,0.2", "goal-y": "0,0.1"}}, 3),
     "point-mass-easy": ("point-mass-easy", {"vary": {"goal-x": "-0.1,0.2"}}, 3),
+    "point-mass-scale": ("point-mass-vary-goal", {"combine": "paired", "vary": SCALED}, 3),
     "reacher-target": ("reacher-vary-goal", {"vary": {"target-angle": "-1,2", **STRAIGHT}}, 3),
     "reacher": ("reacher-easy", {"vary": {"target-size": "0.1,0.15"}}, 3),
     "cheetah-speed": ("cheetah-run-vary-speed", {"vary": {"speed": "1,3"}}, 10),
@@ -88,6 +90,20 @@ def test_a_relabelled_step_is_that_of_the_other_task(name):
         np.testing.assert_allclose(relabelled.obs, shown, rtol=1e-6, atol=1e-6)
     assert np.mean(np.abs(relabelled.reward - after.reward) > 1e-3) > 0.02
     assert np.any(np.abs(relabelled.next_obs - after.obs) > 1e-3) == (name in SHOWN)
+
+
+@pytest.mark.parametrize("name", ["point-mass-easy", "point-mass-vary-goal"])
+def test_a_scale_multiplies_rewards_alone(name):
+    """Of the same worlds under the same actions."""
+    env = make(name, vary={"reward-scale": "0.01,1,100"}, combine="grid", split="none", engine="c")
+    keys, action = jax.random.split(KEY, WORLDS), jnp.full((WORLDS, 2), 0.3)
+    tasks, programs = env.tasks(), compiled(env)
+    starts = [programs.reset(alike(tasks, i), keys) for i in range(3)]
+    found = [programs.step(alike(tasks, i), begun.state, action) for i, begun in enumerate(starts)]
+    for i, scale in enumerate((0.01, 1, 100)):
+        np.testing.assert_allclose(found[i].reward, scale * found[1].reward, rtol=1e-5)
+        np.testing.assert_array_equal(found[i].obs, found[1].obs)
+    assert np.any(np.asarray(found[1].reward) > 1e-3)
 
 
 @pytest.mark.parametrize("name", ["point-mass", "reacher"])

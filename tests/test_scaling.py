@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -283,6 +284,22 @@ def test_popart_stays_finite_where_targets_do_not_vary():
         memory, critics = scaling.renew(memory, jnp.float32((7.0 - offset) * factor)[:, None].repeat(3, 1), critics)
     np.testing.assert_allclose(units(scaling, memory), [[1e4, 1e4], [7, 7]], rtol=1e-3)
     assert np.all(np.isfinite(critics[0].own["head"]["kernel"]))
+
+
+@pytest.mark.parametrize("by", [1.0, 100.0])
+def test_popart_begins_with_the_scale_of_the_rewards_before_learning(by):
+    """The root of their mean square, whatever the pieces they come in; 1 where all are 0, and targets alone later."""
+    scaling, random = PopArt(target_rate=0.1), np.random.default_rng(3)
+    rewards = np.float32(by * random.normal(size=(2, 30))) * [[1], [0]]
+    memory = scaling.init(2)
+    for part in np.split(rewards, [3, 20], axis=1):
+        memory = scaling.observe(memory, SimpleNamespace(reward=jnp.float32(part)))
+    first = units(scaling, memory)
+    np.testing.assert_allclose(first, [[1 / np.sqrt(np.mean(rewards[0] ** 2)), 1], [0, 0]], rtol=1e-5)
+    memory, _ = scaling.renew(memory, jnp.float32(random.normal(size=(2, 8))), (critic(0),))
+    later = scaling.observe(memory, SimpleNamespace(reward=jnp.full((2, 5), 1e3)))
+    np.testing.assert_array_equal(units(scaling, later), units(scaling, memory))
+    assert not np.allclose(units(scaling, memory), first, rtol=1e-4)
 
 
 # In an agent.

@@ -57,12 +57,35 @@ def test_trials_that_diverge_never_go_on():
 
 
 @pytest.mark.parametrize(
-    "steps, batch, interval, found",
-    [(400, 8, 100, (100, 200, 400)), (400, 2, 100, (200, 400)), (400, 1, 100, (400,)), (400, 8, 150, (150, 300, 400))],
+    "steps, batch, interval, most, found",
+    [
+        (400, 8, 100, 3, (100, 200, 400)),
+        (400, 2, 100, 3, (200, 400)),
+        (400, 1, 100, 3, (400,)),
+        (400, 8, 150, 3, (150, 300, 400)),
+        (400, 8, 25, 5, (50, 100, 200, 400)),
+        (400, 64, 25, 5, (25, 50, 100, 200, 400)),
+        (400, 64, 25, 1, (400,)),
+    ],
 )
-def test_rungs_are_halves_at_evaluations(steps, batch, interval, found):
-    """As many as a batch can be halved, and three at most."""
-    assert searching.rungs(steps, batch, interval) == found
+def test_rungs_are_halves_at_evaluations(steps, batch, interval, most, found):
+    """As many as a batch can be halved, and no more than are asked for."""
+    assert searching.rungs(steps, batch, interval, most) == found
+
+
+@pytest.mark.parametrize("most, share", [(1, 1.0), (3, 0.5), (5, 0.1875)])
+def test_five_rungs_find_the_best_of_64_with_less_than_a_quarter_of_the_steps(most, share):
+    """Where early returns tell which trial is the best, though they are noisy; one that diverged took steps too."""
+    rungs, random = searching.rungs(1600, 64, 100, most), np.random.default_rng(0)
+    search = dataclasses.replace(begun(64), count=64, batch=64, rungs=rungs)
+    quality = random.permutation(64)
+    while search.running:
+        told = [quality[trial.number] + random.normal() * 1600 / rungs[search.rung] / 4 for trial in search.running]
+        search = searching.climb(search, told, "run")
+    assert search.best is not None and quality[search.best.number] >= 62
+    assert searching.taken(search) == share * 64 * 1600
+    lost = searching.climb(begun(4), [math.nan, 1.0, 2.0, 3.0], "run-1")
+    assert searching.taken(lost) == 4 * 100
 
 
 # Asking.
@@ -134,6 +157,7 @@ RANGE = "--agent.actor-lr=1e-4..1e-2"
         (["--search=8"], "--search needs ranges"),
         (["--search=1", RANGE], "two trials or more"),
         (["--search=4", "--search-batch=5", RANGE], "--search-batch from 1 to as many"),
+        (["--search=4", "--search-rungs=0", RANGE], "--search-rungs must be at least 1"),
         (["--search=4", "--agent.actor-lr=1e-2..1e-4"], "whose end is above its beginning"),
         (["--search=4", RANGE, RANGE], "has two ranges"),
         (["--search=4", "1e-4..1e-2"], "belongs to no flag"),

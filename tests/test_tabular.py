@@ -228,3 +228,31 @@ def test_an_agent_trains_on_it(env, name):
     state = jax.eval_shape(lambda: loop.init(env, agent, settings, env.tasks(), jnp.arange(1)))
     after, _ = jax.eval_shape(lambda state: loop.run_chunk(env, agent, settings, env.tasks(), state), state)
     assert shapes(after) == shapes(state)
+
+
+# Scales of rewards.
+
+
+@pytest.mark.parametrize("kind", [TabularMDP, Bandit])
+def test_tasks_can_differ_by_the_scale_of_their_rewards(kind):
+    """Their values in turn; all else is as without, what is observed of a reward too."""
+    plain, scaled = kind(num_tasks=5), kind(num_tasks=5, vary={"reward-scale": "0.01,1,100"})
+    np.testing.assert_allclose(scaled.tasks().params["reward-scale"], [0.01, 1, 100, 0.01, 1])
+    np.testing.assert_array_equal(scaled.tasks().context, plain.tasks().context)
+    keys = jax.random.split(jax.random.key(0), 50)
+
+    def earned(env):
+        one = lambda task, key: env.step(task, env.reset(task, key).state, jnp.int32(0))._replace(state=None)
+        return jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(env.tasks(), keys)
+
+    found, wanted = earned(scaled), earned(plain)
+    scales = scaled.tasks().params["reward-scale"][:, None]
+    np.testing.assert_array_equal(found.reward, scales * wanted.reward)
+    np.testing.assert_array_equal(found.obs, wanted.obs)
+    assert np.all(wanted.reward.sum(axis=1) > 0)
+
+
+def test_scales_of_drawn_tasks_are_listed():
+    """No episode draws them."""
+    with pytest.raises(InputError, match="in turn: list them"):
+        TabularMDP(vary={"reward-scale": "0.1:10"})

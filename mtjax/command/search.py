@@ -35,8 +35,10 @@ from mtjax.types import InputError
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})")
+_OWN_FLAGS = ("--search", "--search-batch", "--search-rungs")
 _NOT_WITH = ("sweep", "population", "distributed")
 _ROUNDS = 4
+_LEAST_EVALUATIONS = 4
 _SHOWN = 10  # trials of the table on the console
 
 # Reading the command line.
@@ -102,6 +104,8 @@ def configured(argv: Sequence[str]) -> tuple[RunConfig, Search]:
     count, batch = config.search, config.search_batch or -(-config.search // _ROUNDS)
     if count < 2 or not 1 <= batch <= count:
         raise InputError(f"--search={count} needs two trials or more, and --search-batch from 1 to as many: {batch}")
+    if config.search_rungs < 1:
+        raise InputError(f"--search-rungs must be at least 1, which is the end, not {config.search_rungs}")
     names = {flag: name for name, flag in flag_names(config.learner).items()}
     preset = swept.sweepable(config.learner)
     wrong = next((flag for flag in ranges if names.get(flag) not in preset), None)
@@ -110,8 +114,8 @@ def configured(argv: Sequence[str]) -> tuple[RunConfig, Search]:
     own = {names[flag]: ends for flag, ends in ranges.items()}
     for ends in zip(*own.values(), strict=True):
         swept.agent_at(config.learner, dict(zip(own, ends, strict=True)))
-    config, rungs = _with_rungs(config, batch)
-    _, words = split_flags(rest, ("--search", "--search-batch").__contains__, "a number")
+    config, rungs = _with_rungs(config, batch, config.search_rungs)
+    _, words = split_flags(rest, _OWN_FLAGS.__contains__, "a number")
     chosen = {name: preset[name] for name in own}
     return config, Search(own, chosen, count, batch, rungs, config.plan.seed, tuple(words))
 
@@ -126,15 +130,16 @@ def _require_alone(config: RunConfig) -> None:
         raise InputError("--search keeps its replays on the device; leave out --host-replay-size")
 
 
-def _with_rungs(config: RunConfig, batch: int) -> tuple[RunConfig, tuple[int, ...]]:
-    """Return the configuration of every trial, with an evaluation at each rung, and the rungs."""
+def _with_rungs(config: RunConfig, batch: int, most: int) -> tuple[RunConfig, tuple[int, ...]]:
+    """Return the configuration of every trial, with an evaluation at each of at most so many rungs, and the rungs."""
     plan, training = config.plan, config.training
     if not plan.eval_every:
-        plan = dataclasses.replace(plan, eval_every=-(-plan.steps // 4))
+        parts = max(2 ** (min(most, batch.bit_length()) - 1), _LEAST_EVALUATIONS)
+        plan = dataclasses.replace(plan, eval_every=-(-plan.steps // parts))
     shortest = max(plan.interval // config.worlds, config.learner.experience.steps)
     training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, shortest))
-    plain = dataclasses.replace(config, plan=plan, training=training, search=0, search_batch=0)
-    return plain, searching.rungs(plan.steps, batch, max(plan.interval, plain.steps_per_chunk))
+    plain = dataclasses.replace(config, plan=plan, training=training, search=0, search_batch=0, search_rungs=3)
+    return plain, searching.rungs(plan.steps, batch, max(plan.interval, plain.steps_per_chunk), most)
 
 
 # Running.
@@ -167,7 +172,7 @@ def _fitting(config: RunConfig, search: Search) -> Search:
     if largest == search.batch:
         return search
     print(f"{largest} trials fit into memory together, so a round has no more", flush=True)
-    config, rungs = _with_rungs(config, largest)
+    config, rungs = _with_rungs(config, largest, len(search.rungs))
     return dataclasses.replace(search, batch=largest, rungs=rungs)
 
 
@@ -275,4 +280,7 @@ def _conclusion(search: Search, folder: Path, imports: Sequence[str]) -> list[st
     with contextlib.suppress(StopIteration):
         first = next(trial for trial in search.trials if trial.values == search.preset)
         told = f"the preset, trial {first.number}: {amount(searching.last_return(first))}, {first.state}. {told}"
-    return [f"best: trial {best.number}. {told}", f"  {again}", f"score it: {shlex.join(point)}", f"search: {folder}"]
+    whole, share = len(search.trials) * search.rungs[-1], searching.taken(search)
+    steps = f"trials took {share:,} steps a seed, {share / whole:.0%} of the {whole:,} that all to the end take"
+    chosen = [f"best: trial {best.number}. {told}", f"  {again}", f"score it: {shlex.join(point)}"]
+    return [steps, *chosen, f"search: {folder}"]

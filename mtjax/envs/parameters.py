@@ -116,4 +116,5 @@ FRICTION = positive("1", 1.0, _scale_friction)  # scale of the sliding friction 
 DAMPING = positive("1", 1.0, _scale_damping)  # scale of the damping of all joints
 GEAR = positive("1", 1.0, _scale_gear)  # scale of the strength of all actuators
 STRENGTH = positive("1", 1.0, _scale_strength)  # scale of the force of all actuators, servos among them
+REWARD_SCALE = positive("1", 1.0)  # a goal, by which a family that has it multiplies its reward
 WATER = positive("kg/m^3", 0.0, _set_density)  # density of what bodies move in

@@ -20,7 +20,6 @@ from mtjax.names import InputError, replacing
 
 FILE = "search.json"
 RUNNING, FINISHED, GAVE_WAY, DIVERGED = "running", "finished", "gave way", "diverged"
-_MOST_RUNGS = 3
 _LOGARITHMIC = 10  # a range whose end is so many times its beginning is searched by its logarithm
 _RANDOM = 10  # trials at random before the first that learns from others, or one batch if that is fewer
 
@@ -77,9 +76,13 @@ class Search:
         return max(finished, key=last_return, default=None)
 
 
-def rungs(steps: int, batch: int, interval: int) -> tuple[int, ...]:
-    """Return the steps of each rung of a search: halves of the run, at multiples of ``interval`` but for the last."""
-    count = min(_MOST_RUNGS, batch.bit_length())
+def rungs(steps: int, batch: int, interval: int, most: int) -> tuple[int, ...]:
+    """Return the steps of each rung of a search: halves of the run, at multiples of ``interval`` but for the last.
+
+    Args:
+        most: how many there are, if a batch can be halved as often.
+    """
+    count = min(most, batch.bit_length())
     halves = (math.ceil(steps / 2**i / interval) * interval for i in range(count - 1, 0, -1))
     return (*sorted({rung for rung in halves if rung < steps}), steps)
 
@@ -87,6 +90,12 @@ def rungs(steps: int, batch: int, interval: int) -> tuple[int, ...]:
 def last_return(trial: Trial) -> float:
     """Return a trial's return at its last rung; minus infinity if it has none."""
     return list(trial.returns.values())[-1] if trial.returns else -math.inf
+
+
+def taken(search: Search) -> int:
+    """Return the environment steps that all trials have taken, of each seed. One that diverged had begun a rung."""
+    climbed = (len(trial.returns) + (trial.state == DIVERGED) for trial in search.trials)
+    return sum(search.rungs[count - 1] for count in climbed if count)
 
 
 def ask(search: Search) -> Search:

@@ -11,7 +11,7 @@ from mtjax.envs.dm_control.rewards import tolerance
 from mtjax.envs.domain import Domain, rewarded, start_joints
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
-from mtjax.envs.parameters import DAMPING, GEAR, MASS, Parameter
+from mtjax.envs.parameters import DAMPING, GEAR, MASS, REWARD_SCALE, Parameter
 from mtjax.types import Array, Key, Task, Transition
 
 _ARENA = 0.29  # [m] as far as the ball goes from the middle along x and y
@@ -46,6 +46,7 @@ class PointMass(Domain):
         mass: scale of the ball's mass (0.3 kg).
         damping: scale of the damping along both axes.
         gear: scale of both motors' forces.
+        reward-scale: factor of the reward, 1 unless it varies.
 
     Differs from dm_control in: nothing but the constraint solver under MJX, which stops after ``solver_iterations``;
     it acts only where the ball meets a wall.
@@ -59,6 +60,7 @@ class PointMass(Domain):
             "mass": MASS,
             "damping": DAMPING,
             "gear": GEAR,
+            "reward-scale": REWARD_SCALE,
         }
     )
     model_file: ClassVar[str] = "point_mass.xml"
@@ -67,7 +69,7 @@ class PointMass(Domain):
     gpu_engine: ClassVar[str] = "mjx"
     default_iterations: ClassVar[int] = 2
     starts_untouched: ClassVar[bool] = True
-    relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y")
+    relabels: ClassVar[tuple[str, ...]] = ("goal-x", "goal-y", "reward-scale")
     look: ClassVar = Look((0, 0, 0.75), 0, light=(0, 0, 1))
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
@@ -83,7 +85,7 @@ class PointMass(Domain):
     def reward(self, task: Task, world: World, action: Array) -> Array:
         distance, radius = self._target(task, world)
         gentle = jnp.mean(tolerance(action, 0.0, 0.0, 1.0, "quadratic", 0.0))
-        return tolerance(distance, 0.0, radius, radius) * (4 + gentle) / 5
+        return task.goal["reward-scale"] * tolerance(distance, 0.0, radius, radius) * (4 + gentle) / 5
 
     def _target(self, task: Task, world: World) -> tuple[Array, Array]:
         """Return distance () from the goal and the goal's radius () [m]."""
@@ -116,4 +118,4 @@ class PointMassNavigate(PointMass):
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
         distance, radius = self._target(task, world)
-        return tolerance(distance, 0.0, radius, _FALL, "linear", 0.0)
+        return task.goal["reward-scale"] * tolerance(distance, 0.0, radius, _FALL, "linear", 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
-from mtjax.envs.parameters import Parameter
+from mtjax.envs.parameters import REWARD_SCALE, Parameter
 from mtjax.envs.variation import Variation
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
@@ -25,10 +25,11 @@ class DrawnTasks(Choosing, Family):
     """A family whose tasks are random tables of numbers in [0, 1]. The context holds them, scaled to [-1, 1].
 
     Task number i of a split depends on ``task_seed`` and i alone, so that more tasks keep the first ones. The split
-    "dense" holds out up to ten further draws as its interpolation tasks; "none" holds out nothing.
+    "dense" holds out up to ten further draws as its interpolation tasks; "none" holds out nothing. Values of the
+    parameter ``reward-scale``, the factor of a task's rewards, are those of its tasks in turn; no observation shows it.
     """
 
-    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})
+    parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType({"reward-scale": REWARD_SCALE})
 
     @property
     @abc.abstractmethod
@@ -64,11 +65,22 @@ class DrawnTasks(Choosing, Family):
 
     @cached_property
     def variation(self) -> Variation:
-        """Return as many tasks as there are in every split. They differ in no parameter."""
+        """Return as many tasks as there are in every split, with the values of a varied parameter in turn.
+
+        Raises:
+            InputError: episodes would draw the values.
+        """
+        found = super().variation
+        if found.draws is not None:
+            raise InputError("drawn tasks take values of reward-scale in turn: list them, such as 0.01,1,100")
         held_out = min(self.num_tasks, _MOST_HELD_OUT) if self.split == "dense" else 0
         counts = dict(zip(SPLITS, (self.num_tasks, held_out, 0), strict=True))
-        rows = {split: np.zeros((count, 0)) for split, count in counts.items()}
-        return dataclasses.replace(super().variation, rows=rows)
+        rows = {split: np.resize(found.rows["train"], (n, len(found.names))) for split, n in counts.items()}
+        return dataclasses.replace(found, rows=rows)
+
+    def paid(self, task: Task, reward: Array) -> Array:
+        """Return a reward () of 0 or 1 in the task's own scale."""
+        return reward * task.params["reward-scale"] if "reward-scale" in task.params else reward
 
     def build(self) -> dict[str, Any]:
         """Return the tables (R, ...) of every task, and the contexts, which hold them."""
@@ -144,7 +156,8 @@ class TabularMDP(DrawnTasks):
         reward = jax.random.bernoulli(reward_key, task.goal["rewards"][state.cell, chosen]).astype(jnp.float32)
         chances = task.goal["transitions"][state.cell, chosen]
         cell = jax.random.categorical(move_key, jnp.log(chances))
-        return self._step(TabularState(cell.astype(jnp.int32), key), reward)
+        step = self._step(TabularState(cell.astype(jnp.int32), key), reward)
+        return step._replace(reward=self.paid(task, reward))
 
     def _step(self, state: TabularState, reward: Array) -> Step:
         obs = jnp.append(jax.nn.one_hot(state.cell, self.num_states), reward)
@@ -204,4 +217,4 @@ class Bandit(DrawnTasks):
     def step(self, task: Task, state: BanditState, action: Array) -> Step:
         pull_key, key = jax.random.split(state.key)
         reward = jax.random.bernoulli(pull_key, task.goal["rewards"][self.chosen(action)]).astype(jnp.float32)
-        return Step(BanditState(key), jnp.zeros(1), reward, jnp.bool_(False))
+        return Step(BanditState(key), jnp.zeros(1), self.paid(task, reward), jnp.bool_(False))

@@ -1,13 +1,27 @@
 """PopArt scales by the critics' targets."""
 
 import dataclasses
+from functools import partial
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling.base import Moments, NoScaling
-from mtjax.types import Array
+from mtjax.types import Array, Transition
+
+_LEARNING = -1.0
+
+
+class Estimates(NamedTuple):
+    """Holds the moments of targets, and before there are any the mean square of rewards in their place."""
+
+    mean: Array  # (T,)
+    variance: Array  # (T,)
+    square: Array  # (T,) of the rewards before learning
+    count: Array  # (T,) of these rewards; ``_LEARNING`` once there are targets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,11 +34,14 @@ class PopArt(NoScaling):
         m' = m + b (mean(y) - m),  s'^2 = (1 - b) s^2 + b var(y) + b (1 - b) (mean(y) - m)^2
         kernel' = kernel s / s',  bias' = (s bias + m - m') / s'
     The paper's moving second moment is written here as a variance, which rounding cannot make negative. As in Hessel et
-    al., b = 3e-4, s is clipped to [1e-4, 1e6], and m = 0 and s = 1 at the start. The actor's loss uses the scaled
-    values, so that all tasks have one scale; temperatures are in these units too.
+    al., b = 3e-4, and s is clipped to [1e-4, 1e6]. The actor's loss uses the scaled values, so that all tasks have one
+    scale; temperatures are in these units too.
 
-    Differs from the papers: an update uses the units from before it, and each batch of a task's targets is one step of
-    the estimates. Adam's moments of the heads are not rescaled.
+    Differs from the papers: at the start m = 0, and s is the root of the mean square of the task's rewards before
+    learning, or 1 without such rewards, where there it is 1. So tasks are learned alike from the first update on,
+    whatever the scale of their rewards; from 1 to 0.01 estimates would take 30,000 updates. An update uses the units
+    from before it, and each batch of a task's targets is one step of the estimates. Adam's moments of the heads are not
+    rescaled.
     """
 
     target_rate: float = 3e-4
@@ -33,21 +50,32 @@ class PopArt(NoScaling):
     def __post_init__(self):
         parts.require_rates(self, "target_rate")
 
-    def init(self, num_tasks: int) -> Moments:
-        return Moments.begin(num_tasks)
+    def init(self, num_tasks: int) -> Estimates:
+        return Estimates(*Moments.begin(num_tasks), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+
+    def observe(self, memory: Estimates, steps: Transition) -> Estimates:
+        """Set the first units by the rewards before learning; after that, targets alone move them."""
+        learning, added = memory.count == _LEARNING, steps.reward.shape[1]
+        count = memory.count + added
+        drift = jnp.mean(jnp.square(steps.reward), axis=1) - memory.square
+        square = memory.square + drift * added / jnp.maximum(count, 1)
+        new = memory._replace(square=square, count=count, variance=jnp.where(square > 0, square, memory.variance))
+        return jax.tree.map(partial(jnp.where, learning), memory, new)
 
     @staticmethod
-    def std(moments: Moments) -> Array:
+    def std(memory: Estimates) -> Array:
         """Return the standard deviation (T,) that divides targets."""
-        return jnp.clip(jnp.sqrt(moments.variance), 1e-4, 1e6)
+        return jnp.clip(jnp.sqrt(memory.variance), 1e-4, 1e6)
 
-    def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Estimates, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / self.std(memory), memory.mean
 
-    def renew(self, memory: Moments, target: Array, critics: tuple[Params, ...]):
+    def renew(self, memory: Estimates, target: Array, critics: tuple[Params, ...]):
         std = self.std(memory)
         drift = std * jnp.mean(target, axis=1)  # of the old mean, in reward
-        new = memory.moved(self.target_rate, drift, jnp.square(std) * jnp.var(target, axis=1))
+        moments = Moments(memory.mean, memory.variance)
+        moments = moments.moved(self.target_rate, drift, jnp.square(std) * jnp.var(target, axis=1))
+        new = memory._replace(**moments._asdict(), count=jnp.full_like(memory.count, _LEARNING))
         factor = std / self.std(new)
         offset = (memory.mean - new.mean) / self.std(new)  # by as much as the mean moved, rounding included
         return new, tuple(rescale_heads(critic, factor, offset) for critic in critics)
