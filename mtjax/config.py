@@ -201,7 +201,7 @@ class RunConfig:
     @cached_property
     def trained(self) -> BaseAgent:
         """Return the agent as it is trained, with its schedule's length."""
-        return planned(self.learner, self.length)
+        return planned(self.learner, self.length) if isinstance(self.learner, BaseAgent) else self.learner
 
     @property
     def longest(self) -> int:
@@ -393,11 +393,11 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
 def _with_policy(agent: Any, env: Any) -> Any:
     """Return the agent with the policy for an environment's actions.
 
-    Only discrete ones are counted, as a policy of continuous ones needs no size, which may take a compiled model.
+    A policy of a family's continuous ones needs no size, which may take a compiled model.
     """
     if not isinstance(agent, BaseAgent):
         return agent
-    policy = policy_for(env.spec.action) if getattr(env, "discrete", True) else Gaussian()
+    policy = Gaussian() if isinstance(env, FamilyOrMixture) and not env.discrete else policy_for(env.spec.action)
     return agent if agent.policy == policy else dataclasses.replace(agent, policy=policy)
 
 

@@ -6,7 +6,8 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 
 import dataclasses
 import itertools
-from typing import Any, ClassVar, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -303,11 +304,31 @@ class Lasting(Env, Protocol):
     def observe_worlds(self, tasks: Task, states: Any) -> Any: ...  # what agents see of states, leaves (S, T, E, ...)
 
 
+@runtime_checkable
 class Returning(Lasting, Protocol):
     """An environment that has a task of going back to the start, as the curriculum forward-backward asks."""
 
     def returning(self, task: Task) -> Task: ...  # whose end is where worlds of ``task`` begin
     def distance(self, task: Task, state: Any) -> Array: ...  # of a state to the task's end, which has at most 1
+
+
+@runtime_checkable
+class Relabelling(Protocol):
+    """An environment some of whose tasks may differ in goals alone, so that steps of one can be another's."""
+
+    @property
+    def parameters(self) -> Mapping[str, Any]: ...
+    @property
+    def varied(self) -> tuple[str, ...]: ...  # the parameters that differ between tasks
+    @property
+    def relabels(self) -> tuple[str, ...]: ...  # those that are goals, which ``relabel`` can exchange
+    @property
+    def fresh_goals(self) -> bool: ...  # whether every episode draws a goal of its own, whatever its task
+    @property
+    def pixels(self) -> int: ...  # on each side of the pictures that agents observe; 0 if they see none
+    @property
+    def repeat(self) -> int: ...  # control steps in a step
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition: ...
 
 
 class Storage(NamedTuple):
