@@ -22,7 +22,7 @@ from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.rates import planned
 from mtjax.agents.swept import agents_at
 from mtjax.agents.teacher import Teacher
-from mtjax.checks import MOST_EPISODES, check_fields, path, require_text
+from mtjax.checks import MOST_EPISODES, check_fields, path, require_counts, require_not_negative, require_text
 from mtjax.envs import make
 from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning import combinations, populations, trials
@@ -63,9 +63,8 @@ class Plan:
 
     def __post_init__(self):
         check_fields(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=MOST_EPISODES)
-        for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
-            if getattr(self, field) < least:
-                raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
+        require_counts(self, "steps", "seeds", "eval_episodes")
+        require_not_negative(self, "seed", "eval_every")
         if self.seed + self.seeds > 2**31:
             raise InputError(f"seeds must end below 2^31, and {self.seed} + {self.seeds} does not")
         _ = self.rule

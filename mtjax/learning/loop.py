@@ -17,7 +17,7 @@ from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, numbers_of, with_numbers
 from mtjax.agents.task_changes import change, consolidate, consolidates
-from mtjax.checks import check_fields
+from mtjax.checks import check_fields, require_counts
 from mtjax.learning import curricula
 from mtjax.learning.rollout import (
     EnvStep,
@@ -75,9 +75,7 @@ class Settings:
 
     def __post_init__(self):
         check_fields(self)
-        for name in ("num_envs", "chunk_steps", "trials"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        require_counts(self, "num_envs", "chunk_steps", "trials")
         if self.reset_free and self.trials > 1:
             raise InputError(f"--reset-free has no episodes to repeat; use --trials=1, not {self.trials}")
         _ = self.trial, self.plays
