@@ -285,10 +285,12 @@ def with_preset(
     require_text(preset_name, "preset")
     if preset_name not in PRESETS:
         raise nearest_error("preset", preset_name, PRESETS)
-    device = _device_preset() if preset_name == "auto" else preset_name
+    device = preset_name
+    if device == "auto":
+        device = "cpu" if jax.default_backend() == "cpu" else "gpu"
     preset, common = load_preset(env_name, device), load_preset("+", device)
     table = lambda name: common.get(name, {}) | preset.get(name, {})
-    tuned, seen = tuned_as(agent_name), _sees_pictures(made)
+    tuned, seen = tuned_as(agent_name), any(part.family.pixels for part in made.parts)
     chosen = table(tuned) | (table(f"{tuned}-pictures") if seen else {})
     if preset_of(agent_name).cls.common_presets:
         from_pictures = table("pictures") if seen else {}
@@ -443,14 +445,6 @@ def _preset_files(env_name: str) -> list[str]:
         return [name for found in (kinds, suites) if len(found) == 1 for name in found]
     words = [] if "+" in env_name else env_name.split("-")
     return ["-".join(words[:n]) for n in range(len(words), 0, -1)]
-
-
-def _sees_pictures(family: FamilyOrMixture) -> bool:
-    return any(part.family.pixels for part in family.parts)
-
-
-def _device_preset() -> str:
-    return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
 def own_files(config: RunConfig) -> tuple[str, ...]:

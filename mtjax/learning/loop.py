@@ -255,7 +255,7 @@ def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state:
     """Return the agents (S, ...) as they end the task that was played, from whose steps they may learn once more."""
     if not consolidates(agent):
         return state.agent
-    keys = _folded(state.key)
+    keys = jax.vmap(lambda key: jax.random.fold_in(key, _END))(state.key)
     fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, numbers_of(state.agent))
     if agent.continual.restarts:
         return fresh()
@@ -278,11 +278,6 @@ def _last_rollout(env: Env, agent: Agent, settings: Settings, tasks: Task, state
         return ()
     act_keys, reset_keys = split_keys(keys, 2)
     return _collect(env, agent, settings, tasks, state, act_keys, reset_keys)[1]
-
-
-def _folded(keys: Key) -> Key:
-    """Return keys (S,) for what happens where a task ends."""
-    return jax.vmap(lambda key: jax.random.fold_in(key, _END))(keys)
 
 
 def _of_played(learners: Any, rows: Array | None) -> Any:
