@@ -32,9 +32,9 @@ from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.fit import learned
 from mtjax.agents.networks import Params
-from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
+from mtjax.agents.parts.policies import Taken
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
 from mtjax.agents.replay_batches import Batch, slow_copies
 from mtjax.agents.unseen_tasks import describe_unseen

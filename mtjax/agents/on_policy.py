@@ -13,7 +13,7 @@ from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.fit import Fit, Losses, above_least, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Network, Params
-from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy
+from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy, Taken
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
@@ -25,13 +25,6 @@ LOG_RATIO_LIMIT = 20.0
 """Bound of |log ratio| of two policies, so that its exponential stays finite."""
 HEAD_SCALE = 0.01
 """Factor of the output layers' initial weights: all policies begin nearly equal, and values near zero."""
-
-
-class Taken(NamedTuple):
-    """Holds what is stored with an action when it is taken."""
-
-    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,); of discrete ones itself
-    log_prob: Array  # () its log-probability under the policy that took it
 
 
 class ActorAux(NamedTuple):
