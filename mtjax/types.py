@@ -220,16 +220,16 @@ class Transition(NamedTuple):
     memory: Any = None  # what the agent remembered of the trial before the step
 
 
-class Sometimes(NamedTuple):
-    """Holds a metric that only some updates have; its mean is that of ``value`` over that of ``weight``."""
+class Weighted(NamedTuple):
+    """Holds a metric of an update that counts by a weight in means over updates, as not all updates have it."""
 
     value: Any  # 0 where the update does not have it
     weight: Any  # 1 where the update has it, else 0; of the same shape
 
-    @staticmethod
-    def over(metrics: Metrics, present: Array) -> "dict[str, Sometimes]":
-        """Return metrics that an update has if ``present`` ()."""
-        return {name: Sometimes(x, jnp.full(x.shape, present, jnp.float32)) for name, x in metrics.items()}
+    @property
+    def mean(self) -> Array:
+        """The mean over updates, given means of value and weight; NaN if none has the metric."""
+        return self.value / self.weight
 
 
 class Acted(NamedTuple):
@@ -390,6 +390,7 @@ class Agent(Protocol):
     # After a step, whose next observation is here the one from before any reset:
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...
     def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
+    # One gradient step. Its metrics are (T,) each, or ``Weighted`` if only some updates have them:
     def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...
     def observe(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # (T, H, E, ...), once, after learning
 

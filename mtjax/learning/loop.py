@@ -33,7 +33,7 @@ from mtjax.learning.rollout import (
 from mtjax.learning.trials import ResetFree, Trials, of_episodes
 from mtjax.parallel import collectives
 from mtjax.parallel.axes import over_seeds, when
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Task, Transition, Weighted
 
 PHASES = 10
 """Largest number of different first ages, as each causes a separate reset in every episode."""
@@ -486,7 +486,7 @@ def _summarise(history: dict, count: int) -> Metrics:
     for loss in jax.tree.leaves(losses):
         bad |= blameless & ~jnp.isfinite(loss).reshape(len(loss), 1, loss.shape[1], -1)
     means = jax.tree.map(mean, losses)
-    return {name: x.value / x.weight if isinstance(x, Sometimes) else x for name, x in means.items()} | {
+    return {name: x.mean if isinstance(x, Weighted) else x for name, x in means.items()} | {
         "episodes": episodes,
         "return": total / episodes,
         **{name: x / episodes for name, x in metrics.items()},
