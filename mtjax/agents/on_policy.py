@@ -15,8 +15,6 @@ from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy, Taken
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
-from mtjax.agents.parts.samplers import SAMPLERS
-from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.state import AgentState, Nets
 from mtjax.experience import Rollouts
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
@@ -133,9 +131,9 @@ class OnPolicy(BaseAgent):
         low, high = STD_RANGE
         if not low < self.initial_std < high:
             raise InputError(f"initial-std must be between {low:.2g} and {high:.2g}, not {self.initial_std}")
-        if parts.name_of(SCALINGS, self.scaling) == "popart":
+        if self.scaling.rescales:
             raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
-        if parts.name_of(SAMPLERS, self.sampler) == "temperature":
+        if self.sampler.by_temperature:
             raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
         given, usual = (parts.settings(x) for x in (self.representation, type(self.representation)()))
         for name in ("encoder_tau", "shift"):

@@ -1,6 +1,7 @@
 """PopArt scales by the critics' targets."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax.numpy as jnp
 
@@ -27,6 +28,7 @@ class PopArt(NoScaling):
     the estimates. Adam's moments of the heads are not rescaled.
     """
 
+    rescales: ClassVar[bool] = True
     target_rate: float = 3e-4
     """Weight of a new batch in the moving estimates of targets' mean and variance."""
 
