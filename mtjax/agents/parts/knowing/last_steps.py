@@ -106,5 +106,5 @@ class LastSteps(Nothing):
             return Params({}, {"trajectory": Network.for_each_task(self.encoder.init, key, num_tasks, seen)})
         return Params({"trajectory": self.encoder.init(key, seen)}, {})
 
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+    def features(self, params: dict[str, Any], task_vector: Array, seen: Any) -> Array:
         return self.encoder.apply(params["trajectory"], seen)  # type: ignore

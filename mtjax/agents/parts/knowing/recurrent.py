@@ -83,7 +83,7 @@ class Remembering(Nothing):
     def remember(self, params: dict[str, Any], hidden: Any, step: Transition) -> Any:
         return self.advance(params, hidden, self.read(params, step))
 
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+    def features(self, params: dict[str, Any], task_vector: Array, seen: Any) -> Array:
         if isinstance(seen.past, Hidden):
             return self.show(params, seen.past.state)
         track = self.burned_in(params, seen.past)
