@@ -79,19 +79,18 @@ def sample(
     """
     source_key, row_key, task_key, goal_key = jax.random.split(key, 4)
     num_tasks, count = shape[0], max(round(share * shape[2]), 1)
-    again = (*shape[:2], count)
-    if judge is not None:
-        own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
-        rows = rings.sample_from(ring, row_key, own, window)
-        first = jax.tree.map(lambda x: x[:, :, :count], rows)
+    again, source = (*shape[:2], count), jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
+    if judge is None:
+        shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
+        source = source.at[:, :, :count].add(shift) % num_tasks
+    rows = rings.sample_from(ring, row_key, source, window)
+    first = jax.tree.map(lambda x: x[:, :, :count], rows)
+    if judge is None:
+        keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
+        of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
+        new = jax.vmap(of_task)(tasks, first, *keys)
+    else:
         new = relabel_inversely(env, tasks, first, task_key, goal_key, source_key, judge)
-        return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
-    shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
-    own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
-    rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks, window)
-    keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
-    of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
-    new = jax.vmap(of_task)(tasks, jax.tree.map(lambda x: x[:, :, :count], rows), *keys)
     return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
 
 
