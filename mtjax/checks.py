@@ -5,14 +5,14 @@ import importlib
 import numbers
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from mtjax.names import InputError
+from mtjax.names import InputError, nearest_error
 
 OF_TRAIN = (
     *("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger", "trials"),
@@ -234,3 +234,37 @@ def require_library(module: str, what: str = "") -> Any:
     except ImportError:
         extra = _EXTRAS.get(module, module)
         raise InputError(f"{what or f'--{extra}'} needs {module}: pip install 'mtjax[{extra}]'") from None
+
+
+# Checks of settings. Each raises an InputError that names the setting, its value and what is allowed.
+
+
+def require_choices(holder: Any) -> None:
+    """Require every setting of ``Literal`` type to be one of its choices."""
+    for field in dataclasses.fields(holder):
+        allowed = get_args(field.type) if get_origin(field.type) is Literal else ()
+        value = getattr(holder, field.name)
+        if allowed:
+            require_text(value, field.name)
+        if allowed and value not in allowed:
+            raise nearest_error(field.name.replace("_", "-"), value, allowed)
+
+
+def _require(rule: str, holds: Callable[[Any], Any]) -> Callable[..., None]:
+    """Return a check that a rule holds for those fields of a dataclass that are named."""
+
+    def require(holder: Any, *names: str) -> None:
+        for name in names:
+            if not holds(getattr(holder, name)):
+                raise InputError(f"{name.replace('_', '-')} {rule}, not {getattr(holder, name)}")
+
+    return require
+
+
+require_positive = _require("must be greater than 0", lambda x: x > 0)
+require_not_negative = _require("must be at least 0", lambda x: x >= 0)
+require_rates = _require("must be in (0, 1]", lambda x: 0 < x <= 1)
+require_shares = _require("must be in [0, 1]", lambda x: 0 <= x <= 1)
+require_counts = _require("must be at least 1", lambda x: x >= 1)
+require_layers = _require("needs at least one layer of at least one unit", lambda x: x and min(x) >= 1)
+require_widths = _require("must be of at least one unit each", lambda x: all(width >= 1 for width in x))

@@ -22,7 +22,7 @@ from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.rates import planned
 from mtjax.agents.swept import agents_at
 from mtjax.agents.teacher import Teacher
-from mtjax.checks import MOST_EPISODES, check_fields, path, require_text
+from mtjax.checks import MOST_EPISODES, check_fields, path, require_counts, require_not_negative, require_text
 from mtjax.envs import make
 from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning import combinations, populations, trials
@@ -63,9 +63,8 @@ class Plan:
 
     def __post_init__(self):
         check_fields(self, steps=_MOST_STEPS, eval_every=_MOST_STEPS, seeds=_MOST_SEEDS, eval_episodes=MOST_EPISODES)
-        for field, least in (("steps", 1), ("seeds", 1), ("seed", 0), ("eval_every", 0), ("eval_episodes", 1)):
-            if getattr(self, field) < least:
-                raise InputError(f"{field.replace('_', '-')} must be at least {least}, not {getattr(self, field)}")
+        require_counts(self, "steps", "seeds", "eval_episodes")
+        require_not_negative(self, "seed", "eval_every")
         if self.seed + self.seeds > 2**31:
             raise InputError(f"seeds must end below 2^31, and {self.seed} + {self.seeds} does not")
         _ = self.rule
@@ -204,7 +203,7 @@ class RunConfig:
     @cached_property
     def trained(self) -> BaseAgent:
         """Return the agent as it is trained, with its schedule's length."""
-        return planned(self.learner, self.length)
+        return planned(self.learner, self.length) if isinstance(self.learner, BaseAgent) else self.learner
 
     @property
     def longest(self) -> int:
@@ -289,10 +288,12 @@ def with_preset(
     require_text(preset_name, "preset")
     if preset_name not in PRESETS:
         raise nearest_error("preset", preset_name, PRESETS)
-    device = _device_preset() if preset_name == "auto" else preset_name
+    device = preset_name
+    if device == "auto":
+        device = "cpu" if jax.default_backend() == "cpu" else "gpu"
     preset, common = load_preset(env_name, device), load_preset("+", device)
     table = lambda name: common.get(name, {}) | preset.get(name, {})
-    tuned, seen = tuned_as(agent_name), _sees_pictures(made)
+    tuned, seen = tuned_as(agent_name), any(part.family.pixels for part in made.parts)
     chosen = table(tuned) | (table(f"{tuned}-pictures") if seen else {})
     if preset_of(agent_name).cls.common_presets:
         from_pictures = table("pictures") if seen else {}
@@ -396,11 +397,11 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
 def _with_policy(agent: Any, env: Any) -> Any:
     """Return the agent with the policy for an environment's actions.
 
-    Only discrete ones are counted, as a policy of continuous ones needs no size, which may take a compiled model.
+    A policy of a family's continuous ones needs no size, which may take a compiled model.
     """
     if not isinstance(agent, BaseAgent):
         return agent
-    policy = policy_for(env.spec.action) if getattr(env, "discrete", True) else Gaussian()
+    policy = Gaussian() if isinstance(env, FamilyOrMixture) and not env.discrete else policy_for(env.spec.action)
     return agent if agent.policy == policy else dataclasses.replace(agent, policy=policy)
 
 
@@ -447,14 +448,6 @@ def _preset_files(env_name: str) -> list[str]:
         return [name for found in (kinds, suites) if len(found) == 1 for name in found]
     words = [] if "+" in env_name else env_name.split("-")
     return ["-".join(words[:n]) for n in range(len(words), 0, -1)]
-
-
-def _sees_pictures(family: FamilyOrMixture) -> bool:
-    return any(part.family.pixels for part in family.parts)
-
-
-def _device_preset() -> str:
-    return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
 def own_files(config: RunConfig) -> tuple[str, ...]:

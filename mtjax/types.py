@@ -6,7 +6,8 @@ Axes, used in every docstring: ``S`` seeds, ``T`` tasks, ``E`` environments per 
 
 import dataclasses
 import itertools
-from typing import Any, ClassVar, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -219,16 +220,16 @@ class Transition(NamedTuple):
     memory: Any = None  # what the agent remembered of the trial before the step
 
 
-class Sometimes(NamedTuple):
-    """Holds a metric that only some updates have; its mean is that of ``value`` over that of ``weight``."""
+class Weighted(NamedTuple):
+    """Holds a metric of an update that counts by a weight in means over updates, as not all updates have it."""
 
     value: Any  # 0 where the update does not have it
     weight: Any  # 1 where the update has it, else 0; of the same shape
 
-    @staticmethod
-    def over(metrics: Metrics, present: Array) -> "dict[str, Sometimes]":
-        """Return metrics that an update has if ``present`` ()."""
-        return {name: Sometimes(x, jnp.full(x.shape, present, jnp.float32)) for name, x in metrics.items()}
+    @property
+    def mean(self) -> Array:
+        """The mean over updates, given means of value and weight; NaN if none has the metric."""
+        return self.value / self.weight
 
 
 class Acted(NamedTuple):
@@ -303,11 +304,31 @@ class Lasting(Env, Protocol):
     def observe_worlds(self, tasks: Task, states: Any) -> Any: ...  # what agents see of states, leaves (S, T, E, ...)
 
 
+@runtime_checkable
 class Returning(Lasting, Protocol):
     """An environment that has a task of going back to the start, as the curriculum forward-backward asks."""
 
     def returning(self, task: Task) -> Task: ...  # whose end is where worlds of ``task`` begin
     def distance(self, task: Task, state: Any) -> Array: ...  # of a state to the task's end, which has at most 1
+
+
+@runtime_checkable
+class Relabelling(Protocol):
+    """An environment some of whose tasks may differ in goals alone, so that steps of one can be another's."""
+
+    @property
+    def parameters(self) -> Mapping[str, Any]: ...
+    @property
+    def varied(self) -> tuple[str, ...]: ...  # the parameters that differ between tasks
+    @property
+    def relabels(self) -> tuple[str, ...]: ...  # those that are goals, which ``relabel`` can exchange
+    @property
+    def fresh_goals(self) -> bool: ...  # whether every episode draws a goal of its own, whatever its task
+    @property
+    def pixels(self) -> int: ...  # on each side of the pictures that agents observe; 0 if they see none
+    @property
+    def repeat(self) -> int: ...  # control steps in a step
+    def relabel(self, task: Task, transition: Transition, key: Key) -> Transition: ...
 
 
 class Storage(NamedTuple):
@@ -369,6 +390,7 @@ class Agent(Protocol):
     # After a step, whose next observation is here the one from before any reset:
     def remember(self, state: Any, memory: Any, transition: Transition, task: Task) -> Any: ...
     def assess(self, state: Any, steps: Transition, tasks: Task) -> tuple[Any, Transition]: ...  # (T, H, E, ...), once
+    # One gradient step. Its metrics are (T,) each, or ``Weighted`` if only some updates have them:
     def update(self, state: Any, window: Transition, tasks: Task, key: Key, number: Array) -> tuple[Any, Metrics]: ...
     def observe(self, state: Any, steps: Transition, tasks: Task) -> Any: ...  # (T, H, E, ...), once, after learning
 

@@ -32,9 +32,9 @@ from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.fit import learned
 from mtjax.agents.networks import Params
-from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.gradients.balancing import FAMO
 from mtjax.agents.parts.knowing.last_steps import Past, Seen, append
+from mtjax.agents.parts.policies import Taken
 from mtjax.agents.parts.representations.deepmdp import ModelTargets
 from mtjax.agents.replay_batches import Batch, slow_copies
 from mtjax.agents.unseen_tasks import describe_unseen
@@ -81,7 +81,7 @@ def one_task(agent):
     next_past = append(past, batch.obs, batch.action, batch.reward) if agent.view.history else None
     see = lambda obs, past: agent.view.see(Params({}, {}), obs, past)
     normal = lambda *shape: jnp.float32(random.normal(size=shape))
-    width = len(agent.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, None))
+    width = len(agent.conditioning.task_vector(jnp.int32(0), pick(TASKS, 0), 3, None))
     drawn = agent.representation.transition == "probabilistic"
     value = normal(BATCH)
     other_theta = normal(agent.representation.theta_size) if agent.representation.embeds else None

@@ -359,16 +359,22 @@ def test_gradients_of_ppo_are_those_of_the_policy_gradient():
 
 @pytest.mark.parametrize("name", ["maml", "options", "distil"])
 def test_agents_whose_losses_are_not_of_single_steps_are_refused(name):
-    with pytest.raises(InputError, match=f"(?i)losses of single steps, and those of {name} are not"):
-        diagnostics.with_experience(SimpleNamespace(agent=tiny(name), env=Walk()), "")
+    refused(tiny(name), Walk(), f"(?i)losses of single steps, and those of {name} are not")
+
+
+def refused(agent, env, message):
+    """Before a run's data are read, and of data that are given."""
+    policy = SimpleNamespace(agent=agent, env=env)
+    with pytest.raises(InputError, match=message):
+        diagnostics.with_experience(policy, "")
+    with pytest.raises(InputError, match=message):
+        diagnostics.diagnose(policy, None, 4)
 
 
 def test_memories_and_pictures_are_refused():
-    with pytest.raises(InputError, match="learns from windows"):
-        diagnostics.with_experience(SimpleNamespace(agent=tiny("rl2"), env=Walk()), "")
+    refused(tiny("rl2"), Walk(), "learns from windows")
     shown = SimpleNamespace(spec=Spec({"pixels": jax.ShapeDtypeStruct((64, 64, 3), jnp.uint8)}, Continuous(1), 1))
-    with pytest.raises(InputError, match="networks take vectors"):
-        diagnostics.with_experience(SimpleNamespace(agent=tiny("sac"), env=shown), "")
+    refused(tiny("sac"), shown, "networks take vectors")
 
 
 @pytest.mark.parametrize("encoder", one_in(3, ENCODERS))

@@ -30,8 +30,7 @@ import mtjax
 from mtjax.agents import AGENTS, for_action, options
 from mtjax.agents.base import Memory
 from mtjax.agents.hyperparameters import replace
-from mtjax.agents.on_policy import Taken
-from mtjax.agents.parts.policies import Gaussian
+from mtjax.agents.parts.policies import Gaussian, Taken
 from mtjax.agents.parts.values import C51
 from mtjax.compiling.programs import compile_lowered
 from mtjax.config import configure

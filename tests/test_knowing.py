@@ -89,7 +89,7 @@ def test_what_is_told_has_the_promised_attributes(name, tmp_path):
 
     def shown():
         nets = of_task(made.init(spec, TASKS, KEY).nets, 0)
-        given = made.conditioning.given(jnp.int32(0), pick(TASKS, 0), 3, jnp.ones((3, 2)))
+        given = made.conditioning.task_vector(jnp.int32(0), pick(TASKS, 0), 3, jnp.ones((3, 2)))
         return made.view.know(nets, given, made.view.example(spec, init_inputs(spec, 3)))
 
     features, obs = shown()

@@ -202,8 +202,8 @@ READ = {
 _RUN = ("training.run", "training.journal", "training.memory", "training.host_replay")
 READERS = ("learning", "compiling", "parallel.axes", "saved.folder", *_RUN)
 KNOWN = {  # where it is known which class it is
-    types.Env: {"calls", "relabels", "varied", "fresh_goals", "observe_worlds", "returning", "distance"},
-    types.Agent: {"adapt", "conditioning", "gradients", "heads", "representation", "view"},
+    types.Env: {"calls", "parts", "relabels", "varied", "fresh_goals", "observe_worlds", "returning", "distance"},
+    types.Agent: {"adapt", "conditioning", "gradients", "heads", "policies", "policy", "representation", "view"},
     types.Experience: {"capacity", "hindsight", "n_step"},
 }
 

@@ -11,7 +11,7 @@ from probes import Walk, adapted_gain, of_task, only_seed, pick, tiny, train, wi
 import mtjax
 from mtjax.agents import agent, clipped_ratio, for_action
 from mtjax.agents.maml import MAML
-from mtjax.agents.on_policy import Taken
+from mtjax.agents.parts.policies import Taken
 from mtjax.envs.probes import Probe, World, tasks_of
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Episodes, adapted, evaluate

@@ -17,10 +17,10 @@ import mtjax
 from mtjax import agents
 from mtjax.agents import for_action
 from mtjax.agents.base import Memory
-from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.inference import Belief, change, divergence, factor, product, unit
 from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.parts.knowing.recurrent import Following, Hidden, Track
+from mtjax.agents.parts.policies import Taken
 from mtjax.experience import rollouts
 from mtjax.types import Discrete, InputError, Spec, Transition
 

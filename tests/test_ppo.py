@@ -29,13 +29,13 @@ from mtjax.agents import clipped_ratio, critics, normalize
 from mtjax.agents.base import Memory
 from mtjax.agents.critics import Units
 from mtjax.agents.networks import OVER_TASKS
-from mtjax.agents.on_policy import Batch, Taken
+from mtjax.agents.on_policy import Batch
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.gradients.surgery import RULES
 from mtjax.agents.parts.knowing import CONDITIONINGS
 from mtjax.agents.parts.knowing.last_steps import Past, Seen
-from mtjax.agents.parts.policies import Gaussian
+from mtjax.agents.parts.policies import Gaussian, Taken
 from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments

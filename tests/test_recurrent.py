@@ -14,8 +14,8 @@ import mtjax
 from mtjax import agents
 from mtjax.agents import replay_batches
 from mtjax.agents.base import Memory
-from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.recurrent import Following, Recurrent, Track
+from mtjax.agents.parts.policies import Taken
 from mtjax.agents.ppo import PPO
 from mtjax.experience import rollouts
 from mtjax.types import InputError, Spec, Transition

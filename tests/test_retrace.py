@@ -10,7 +10,7 @@ from probes import Walk, of_task, pick, quick, random_batch, slow_but, tasks_of,
 
 from mtjax.agents import replay_batches
 from mtjax.agents.networks import Params
-from mtjax.agents.parts.targets import Behaviour
+from mtjax.agents.parts.policies import Taken
 from mtjax.config import configure
 from mtjax.experience.replay import Replay
 from mtjax.learning import loop
@@ -34,7 +34,7 @@ def windows():
     cut = (steps.discount == 0) | (random.random(shape) < 0.15)
     raw = jnp.arctanh(steps.action)
     raw = raw.at[:, 0, 1].add(0.5)  # a random action was taken instead
-    kept = Behaviour(raw, jnp.float32(random.normal(size=shape) - 1))
+    kept = Taken(raw, jnp.float32(random.normal(size=shape) - 1))
     return steps._replace(ended=cut, closed=cut, cut=cut, extras=kept)
 
 
@@ -106,7 +106,7 @@ def test_only_retrace_keeps_what_it_needs():
     """Three numbers a step for an action of two; other agents store what they did."""
     kept = lambda agent: jax.eval_shape(partial(state_of, agent)).data.ring.rows.extras
     assert kept(tiny("sac")) is None
-    assert jax.tree.map(lambda x: x.shape[4:], kept(tracing("sac"))) == Behaviour((1,), ())
+    assert jax.tree.map(lambda x: x.shape[4:], kept(tracing("sac"))) == Taken((1,), ())
 
 
 def state_of(agent):

@@ -13,9 +13,9 @@ from test_recurrent import Ratios
 import mtjax
 from mtjax import agents
 from mtjax.agents.base import Memory
-from mtjax.agents.on_policy import Taken
 from mtjax.agents.parts.knowing.recurrent import Track
 from mtjax.agents.parts.knowing.transformer import Transformer, attended, shifted
+from mtjax.agents.parts.policies import Taken
 from mtjax.experience import Rollouts, rollouts
 from mtjax.types import InputError, Spec, Transition
 

@@ -15,7 +15,7 @@ from mtjax.agents.swept import with_numbers
 from mtjax.experience import Replay
 from mtjax.learning import loop
 from mtjax.parallel.axes import when
-from mtjax.types import InputError, Sometimes, Spec
+from mtjax.types import InputError, Spec, Weighted
 
 SMALL = {"num_envs": 4, "batch_size": 4, "replay_size": 200, "warmup_steps": 2}
 SPEC, TASKS, KEY = Spec.vector(3, 2, 1), tasks_of("one-step"), jax.random.key(2)
@@ -116,7 +116,7 @@ class Turns(Stub):
         turn = (number + 1) % self.experience.policy_delay == 0
         metrics = {"all": jnp.broadcast_to(jnp.float32(number + 1), len(tasks.id))}
         _, own = when(turn, lambda state: (state, {"own": metrics["all"]}), state)
-        return state + 1, metrics | Sometimes.over(own, turn)
+        return state + 1, metrics | {"own": Weighted(own["own"], jnp.full(len(tasks.id), turn, jnp.float32))}
 
     def init(self, spec, tasks, key):
         return jnp.float32(0)

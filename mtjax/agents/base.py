@@ -249,7 +249,7 @@ class BaseAgent(abc.ABC):
         inputs, action = init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         vectors, seen = self.conditioning.table(spec, num_tasks), view.example(spec, inputs)
         first = jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
-        given = self.conditioning.given(jnp.int32(0), first, num_tasks, vectors)
+        vector = self.conditioning.task_vector(jnp.int32(0), first, num_tasks, vectors)
         known_apart, knowing_key = own and not self.one_knowledge, jax.random.fold_in(key, 1)
         knowing = self.conditioning.init(num_tasks, seen, action, known_apart, knowing_key)
         nets = {
@@ -259,10 +259,10 @@ class BaseAgent(abc.ABC):
             "scaling": Params({}, self.scaling.init(num_tasks)),
             "sampler": Params({}, self.sampler.init(num_tasks)),
         }
-        known = view.know({"knowing": knowing.of_first()}, given, seen)
+        known = view.know({"knowing": knowing.of_first()}, vector, seen)
         nets["representation"], key = self.representation.init(num_tasks, *known, seen, action, own, key)
         one = {name: net.of_first() for name, net in nets.items()}
-        inputs = Inputs(view.actor_inputs(one, given, seen), view.critic_inputs(one, given, seen), action)
+        inputs = Inputs(view.actor_inputs(one, vector, seen), view.critic_inputs(one, vector, seen), action)
         state = self.init_networks(AgentState(nets, {}, {}), inputs, key)
         return state._replace(fits={name: fit.init(state.nets, num_tasks) for name, fit in self.fits.items()})
 

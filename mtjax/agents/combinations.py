@@ -8,6 +8,7 @@ from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.hyperparameters import PARTS
 from mtjax.agents.networks import Trunk
+from mtjax.agents.parts.gradients.surgery import Rule
 from mtjax.agents.parts.policies import policy_for
 from mtjax.types import InputError, Spec
 
@@ -101,7 +102,7 @@ def _check_encoder(agent: Any) -> None:
 def _check_gradients(agent: Any) -> None:
     rule = _name(agent, "gradients")
     for network in ("actor", "critic"):
-        if heads(agent, network) == "disjoint" and rule != "mean":
+        if heads(agent, network) == "disjoint" and type(agent.gradients) is not Rule:
             name = "heads" if disjoint(agent) else f"{network}-heads"
             raise InputError(f"{name}=disjoint leaves no parameters that tasks share for gradients={rule}; use mean")
     if agent.gradient_scope == "per-layer" and agent.gradients.needs != "gradients":
@@ -110,8 +111,8 @@ def _check_gradients(agent: Any) -> None:
 
 def _check_scaling(agent: Any) -> None:
     scaling = _name(agent, "scaling")
-    if scaling == "return" and agent.gamma == 1:
-        raise InputError("scaling=return needs discounted returns, which have bounds; use gamma below 1")
+    if agent.scaling.discounted and agent.gamma == 1:
+        raise InputError(f"scaling={scaling} needs discounted returns, which have bounds; use gamma below 1")
     if agent.scaling.follows_resets and not agent.experience.reset_every:
         raise InputError(
             f"scaling={scaling} renews its factors where networks are reset, and here none are; use scaling=reward, "
@@ -147,15 +148,14 @@ def check_replayed(agent: Any) -> None:
     parts.require_positive(agent, "temperature_lr", "num_critics", "initial_temperature")
     if not 0 <= agent.temperature_momentum < 1:
         raise InputError(f"temperature-momentum must be in [0, 1), not {agent.temperature_momentum}")
-    value, scaling, replay = _name(agent, "value"), _name(agent, "scaling"), agent.experience
-    own = heads(agent, "critic")
-    if scaling == "popart" and (own == "shared" or value != "scalar"):
+    scaling, replay, own = _name(agent, "scaling"), agent.experience, heads(agent, "critic")
+    if agent.scaling.rescales and (own == "shared" or not agent.value.linear):
         raise InputError(
-            "scaling=popart rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
-            f"disjoint, not {value} and {own}"
+            f"scaling={scaling} rescales a scalar head of every task's own; use value=scalar and heads=per-task or "
+            f"disjoint, not {_name(agent, 'value')} and {own}"
         )
-    if scaling == "popart" and agent.unit_head:
-        raise InputError("scaling=popart rescales heads, which unit-head keeps at length 1; use one of them")
+    if agent.scaling.rescales and agent.unit_head:
+        raise InputError(f"scaling={scaling} rescales heads, which unit-head keeps at length 1; use one of them")
     if agent.representation.predicts and replay.n_step > 1:
         name = _name(agent, "representation")
         raise InputError(f"{name} learns models of single steps; use n-step=1, not {replay.n_step}")

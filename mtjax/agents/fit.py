@@ -122,11 +122,11 @@ def above_least(agent: Any, loss: Callable) -> Callable:
     """Subtract its lower bound from the critics' loss of one task, for rules of surgery that compare losses."""
     least = agent.least_loss + agent.representation.least_loss
 
-    def found(nets: Nets, *data: Any) -> tuple[Array, Any]:
+    def excess(nets: Nets, *data: Any) -> tuple[Array, Any]:
         value, aux = loss(nets, *data)
         return value - least, aux
 
-    return found
+    return excess
 
 
 def learned(fits: Collection[Fit]) -> tuple[str, ...]:

@@ -96,7 +96,7 @@ def require_value_range(agent: Any) -> None:
     Raises:
         InputError: the agent has such critics.
     """
-    if "value" in kinds_of(agent):
+    if "value" in kinds_of(agent) and not agent.scaling.fits_returns:
         reason = agent.value.refuses(parts.name_of(SCALINGS, agent.scaling))
         if reason:
             raise InputError(f"value={parts.name_of(VALUES, agent.value)} {reason}")

@@ -12,6 +12,7 @@ from mtjax.agents.hyperparameters import FLAT, PARTS
 from mtjax.agents.networks import Params
 from mtjax.agents.on_policy import ActorAux, Batch, OnPolicy
 from mtjax.agents.parts.adaptation import adapt, surrogate
+from mtjax.agents.parts.knowing import Knowing
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
 from mtjax.experience.rollouts import windows
@@ -86,9 +87,9 @@ class MAML(OnPolicy):
     def __post_init__(self):
         super().__post_init__()
         parts.require_positive(self, "clip_range", "inner_rate")
-        knowing = parts.name_of(PARTS["conditioning"], self.conditioning)
-        if knowing != "none":
-            raise InputError(f"maml finds out its task by adapting to it; use conditioning=none, not {knowing}")
+        if type(self.conditioning) is not Knowing:
+            name = parts.name_of(PARTS["conditioning"], self.conditioning)
+            raise InputError(f"maml finds out its task by adapting to it; use conditioning=none, not {name}")
         combinations.require_heads(self, "shared", "maml has one policy, which adapts to every task")
         if self.representation.learns or self.representation.history:
             raise InputError("maml adapts a policy of observations as they are; use representation=plain")

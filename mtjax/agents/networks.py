@@ -200,6 +200,11 @@ class Network:
         return {self._head_weights: init(key, (width, out)), "bias": jnp.zeros(out)}
 
 
+def init_params(init: Callable[[Key], dict[str, Any]], own: bool, key: Key, num_tasks: int) -> Params:
+    """Return the parts, by name, that ``init`` draws: once for all tasks, or each task's own, leaves (T, ...)."""
+    return Params({}, Network.for_each_task(init, key, num_tasks)) if own else Params(init(key), {})
+
+
 # Vectors of length 1, and layers whose weights are such vectors.
 
 

@@ -13,10 +13,8 @@ from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.fit import Fit, Losses, above_least, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Network, Params
-from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy
+from mtjax.agents.parts.policies import Categorical, Gaussian, MultiCategorical, Policy, Taken
 from mtjax.agents.parts.policies.gaussian import STD_RANGE
-from mtjax.agents.parts.samplers import SAMPLERS
-from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.state import AgentState, Nets
 from mtjax.experience import Rollouts
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
@@ -25,13 +23,6 @@ LOG_RATIO_LIMIT = 20.0
 """Bound of |log ratio| of two policies, so that its exponential stays finite."""
 HEAD_SCALE = 0.01
 """Factor of the output layers' initial weights: all policies begin nearly equal, and values near zero."""
-
-
-class Taken(NamedTuple):
-    """Holds what is stored with an action when it is taken."""
-
-    raw: Array  # the action as ``policy.log_prob`` takes it: before the tanh (A,); of discrete ones itself
-    log_prob: Array  # () its log-probability under the policy that took it
 
 
 class ActorAux(NamedTuple):
@@ -140,9 +131,9 @@ class OnPolicy(BaseAgent):
         low, high = STD_RANGE
         if not low < self.initial_std < high:
             raise InputError(f"initial-std must be between {low:.2g} and {high:.2g}, not {self.initial_std}")
-        if parts.name_of(SCALINGS, self.scaling) == "popart":
+        if self.scaling.rescales:
             raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
-        if parts.name_of(SAMPLERS, self.sampler) == "temperature":
+        if self.sampler.by_temperature:
             raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
         given, usual = (parts.settings(x) for x in (self.representation, type(self.representation)()))
         for name in ("encoder_tau", "shift"):

@@ -1,14 +1,12 @@
 """Learning rates over a run, and discounts of tasks, as an agent's settings say."""
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 
 from mtjax.agents.parts.gradients import descent
 from mtjax.types import Array, InputError, Task
-
-A = TypeVar("A")
 
 
 def scheduled(agent: Any, rate: Any, delay: int = 1) -> Any:
@@ -19,21 +17,20 @@ def scheduled(agent: Any, rate: Any, delay: int = 1) -> Any:
     return descent.schedule(rate, agent.lr_schedule, agent.lr_final, *updates)
 
 
-def planned(agent: A, steps: int) -> A:
+def planned(agent: Any, steps: int) -> Any:
     """Return an agent with its schedule spread over a run of so many steps of every environment.
 
     Raises:
         InputError: the run ends before the schedule's warm-up does.
     """
-    own: Any = agent
-    if getattr(own, "lr_schedule", "constant") == "constant":  # agents of other kinds have none
+    if agent.lr_schedule == "constant":
         return agent
-    each, warmup = own.experience.steps, own.experience.warmup_steps
-    updates = own.lr_updates or own.experience.updates * max(steps // each - warmup // each, 0)
-    if updates <= own.lr_warmup:
-        left = f"none of the run's {updates} updates to lr-schedule={own.lr_schedule}"
-        raise InputError(f"lr-warmup={own.lr_warmup} leaves {left}")
-    return dataclasses.replace(own, lr_updates=updates)
+    each, warmup = agent.experience.steps, agent.experience.warmup_steps
+    updates = agent.lr_updates or agent.experience.updates * max(steps // each - warmup // each, 0)
+    if updates <= agent.lr_warmup:
+        left = f"none of the run's {updates} updates to lr-schedule={agent.lr_schedule}"
+        raise InputError(f"lr-warmup={agent.lr_warmup} leaves {left}")
+    return dataclasses.replace(agent, lr_updates=updates)
 
 
 def discounts(agent: Any, tasks: Task) -> Any:

@@ -9,7 +9,7 @@ import optax
 
 from mtjax.agents.fit import Losses, above_least
 from mtjax.agents.networks import Params
-from mtjax.agents.parts.targets import Behaviour
+from mtjax.agents.parts.policies import Taken
 from mtjax.agents.parts.values import reduce
 from mtjax.agents.rates import discounts, discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
@@ -34,7 +34,7 @@ class Batch(NamedTuple):
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
     model_targets: Any = None  # targets of the representation's models
     followed: Array | None = None  # (B,) bool: next_obs is what followed; None: it always is
-    behaviour: Behaviour | None = None  # of the policy that acted, if targets ask for it
+    behaviour: Taken | None = None  # of the policy that acted, if targets ask for it
     cut: Array | None = None  # (B,) bool: sums of rewards end with the step, if targets sum over windows
 
 
@@ -70,7 +70,7 @@ def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key:
     """
     batch, inputs, view = transitions(agent, window, tasks), state.nets["inputs"], agent.view
     batch = batch if key is None else agent.representation.augment(batch, key)
-    kept = batch.extras if isinstance(batch.extras, Behaviour) else None
+    kept = batch.extras if isinstance(batch.extras, Taken) else None
     last = batch.extras if isinstance(batch.extras, Transition) else batch
     past, next_past = view.around(inputs, window, batch, last)
     temperature = jnp.exp(state.nets["temperature"].parts["log"])

@@ -22,7 +22,7 @@ from mtjax.agents.replay_batches import ActorAux, Batch, CriticAux, Sample
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Replay
 from mtjax.parallel.axes import when
-from mtjax.types import Acted, Array, Key, Metrics, Sometimes, Task, Transition
+from mtjax.types import Acted, Array, Key, Metrics, Task, Transition, Weighted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +192,8 @@ class SAC(BaseAgent):
         turn = (number + 1) % delay == 0
         state, actor_metrics = improve(state) if delay == 1 else when(turn, improve, state)
         if delay > 1:
-            actor_metrics = Sometimes.over(actor_metrics, turn)
+            weigh = lambda x: Weighted(x, jnp.full(x.shape, turn, jnp.float32))
+            actor_metrics = {name: weigh(x) for name, x in actor_metrics.items()}
 
         state = replay_batches.renew_scales(self, replay_batches.update_target(self, state), fitted.aux.expected)
         state = unit_resets.renew(self, state, batch, jax.random.fold_in(key, 3), number)

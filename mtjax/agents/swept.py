@@ -13,6 +13,7 @@ import numpy as np
 
 from mtjax.agents import BaseAgent, parts
 from mtjax.agents.hyperparameters import flag_names, kinds_of, settings
+from mtjax.agents.state import AgentState
 from mtjax.checks import shown
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError
@@ -74,7 +75,7 @@ def at_point(agent: Any, state: Any) -> Any:
 
 def numbers_of(state: Any) -> dict[str, Array]:
     """Return the numbers that an agent's state holds, by name: none outside a sweep, as in states of other kinds."""
-    return getattr(state, "numbers", {})
+    return state.numbers if isinstance(state, AgentState) else {}
 
 
 def _replace_values(agent: BaseAgent, values: Mapping[str, Any], replace: Callable) -> BaseAgent:

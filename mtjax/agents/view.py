@@ -111,7 +111,7 @@ class View:
     def features(self, state: AgentState, task: Task) -> Array:
         """Return those features (Z,) of one task that need no learned parameters."""
         vectors = state.nets["tasks"].shared.get("given")
-        return self.conditioning.given(state.known(task), task, state.num_tasks, vectors)
+        return self.conditioning.task_vector(state.known(task), task, state.num_tasks, vectors)
 
     def features_of_all(self, state: AgentState, batch: Transition, tasks: Task) -> Array:
         """Return these features of a batch's tasks: (T, Z), or (T, B, Z) where each episode has its own."""
@@ -122,22 +122,22 @@ class View:
 
     # Inputs of one task's networks.
 
-    def know(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
+    def know(self, nets: Nets, features: Array, seen: Any) -> tuple[Array, Any]:
         """Return the features (Z,) or (..., Z) of one task, and observations (..., O) without the last steps.
 
         Args:
-            given: features that need no learned parameters, (Z,) or (..., Z).
+            features: those that need no learned parameters, (Z,) or (..., Z).
             seen: a result of ``see``.
         """
-        return self.conditioning.features(nets["knowing"].parts, given, seen), without_past(seen)
+        return self.conditioning.features(nets["knowing"].parts, features, seen), without_past(seen)
 
-    def actor_inputs(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
+    def actor_inputs(self, nets: Nets, features: Array, seen: Any) -> tuple[Array, Any]:
         """Return features (Z,) and inputs (..., O) of one task's actor, from what ``know`` takes."""
-        return self.representation.actor_inputs(nets["representation"], *self.know(nets, given, seen))
+        return self.representation.actor_inputs(nets["representation"], *self.know(nets, features, seen))
 
-    def critic_inputs(self, nets: Nets, given: Array, seen: Any) -> tuple[Array, Any]:
+    def critic_inputs(self, nets: Nets, features: Array, seen: Any) -> tuple[Array, Any]:
         """Return features (Z,) and inputs (..., O) of one task's critics, from what ``know`` takes."""
-        return self.representation.perceive(nets["representation"], *self.know(nets, given, seen))
+        return self.representation.perceive(nets["representation"], *self.know(nets, features, seen))
 
     def keyed(self, batch: Any, key: Key) -> Any:
         """Return a batch (T, ...) with a key for each task, if the loss of what is known of it needs one."""

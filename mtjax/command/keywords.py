@@ -118,7 +118,7 @@ def _require_known(given: Mapping[str, Any], agent: Any, env_name: str, family: 
     if unknown is None:
         return
     parameter, value = unknown.replace("_", "-"), given[unknown]
-    if parameter in getattr(family, "parameters", ()):
+    if isinstance(family, Family) and parameter in family.parameters:
         say = f"vary={{{parameter!r}: {value!r}}}"
         where = f"use {say}" if by_name else f"use mtjax.make({env_name!r}, {say})"
         raise InputError(f"{unknown} is a parameter of {env_name}, not a setting: {where}")

@@ -178,7 +178,7 @@ def _fitting(config: RunConfig, search: Search) -> Search:
 
 def _of_rung(config: RunConfig, search: Search) -> RunConfig:
     """Return the configuration of the running trials."""
-    points = searching.points(search)
+    points = tuple(trial.values for trial in search.running)
     return dataclasses.replace(config, points=points, sweep=swept.words(config.learner, points))
 
 

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import tyro
 
+from mtjax.checks import require_not_negative
 from mtjax.envs import physics
 from mtjax.envs.compiled import compile_model, read_model, stack_differing
 from mtjax.envs.contexts import goals
@@ -23,7 +24,7 @@ from mtjax.envs.engines.base import ENGINES, Engine, World, choose_engine
 from mtjax.envs.family import Family, draw_until
 from mtjax.envs.pixels import Pictured
 from mtjax.names import nearest_error
-from mtjax.types import Array, InputError, Key, Step, Task, Transition
+from mtjax.types import Array, Key, Step, Task, Transition
 
 INTEGRATORS = ("model", "euler")
 
@@ -58,8 +59,7 @@ class Domain(Pictured, Family):
             raise nearest_error("engine", self.engine, ENGINES)
         if self.integrator not in INTEGRATORS:
             raise nearest_error("integrator", self.integrator, INTEGRATORS)
-        if self.solver_iterations < 0:
-            raise InputError(f"solver-iterations must be at least 0, not {self.solver_iterations}")
+        require_not_negative(self, "solver_iterations")
 
     # What a domain gives.
 

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import tyro
 
-from mtjax.checks import require_values
+from mtjax.checks import require_not_negative, require_values
 from mtjax.envs import naming, task_table, variation
 from mtjax.envs.contexts import contexts, goals, ranges
 from mtjax.envs.parameters import Parameter
@@ -81,8 +81,7 @@ class Family(abc.ABC):
         require_values(self, num_tasks=variation.MOST_TASKS, num_draws=variation.MOST_TASKS)
         if self.num_draws < 1 or self.num_tasks < 1:
             raise InputError("num-tasks and num-draws must be at least 1")
-        if self.task_seed < 0:
-            raise InputError(f"task-seed must be at least 0, not {self.task_seed}")
+        require_not_negative(self, "task_seed")
         variation.require_known(self.combine, self.split)  # also where a family has tasks of its own making
         _ = self.variation
 

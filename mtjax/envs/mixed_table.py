@@ -8,6 +8,7 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.envs.blocks import blocks_of
+from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
 from mtjax.envs.task_table import Table
 from mtjax.types import SPLITS, InputError, Spec, Task
@@ -88,7 +89,7 @@ def mixed_spec(families: dict[str, Family], sentences: tuple[str, ...]) -> Spec:
     """
     specs = {name: family.spec for name, family in families.items()}
     _require_one_look(specs)
-    _require_one_kind(specs, any(hasattr(family, "scores") for family in families.values()))
+    _require_one_kind(specs, any(isinstance(family, Choosing) for family in families.values()))
     found = list(specs.values())
     widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, found)),), np.float32)
     return Spec(

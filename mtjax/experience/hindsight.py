@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import Ring
 from mtjax.tasks import episode_task
-from mtjax.types import Array, Env, InputError, Key, Task, Transition
+from mtjax.types import Array, Env, InputError, Key, Relabelling, Task, Transition
 
 
 def require(env: Env) -> None:
@@ -33,23 +33,25 @@ def require(env: Env) -> None:
     Raises:
         InputError: they cannot; it says why.
     """
-    family: Any = env
     if env.spec.mixed:
         raise InputError("hindsight replays steps of one task as another's, and a mixture's tasks share no physics")
-    if getattr(family, "pixels", 0) or getattr(family, "repeat", 1) > 1:
+    if isinstance(env, Relabelling) and (env.pixels or env.repeat > 1):
         raise InputError("hindsight computes rewards from one step's state: leave out --env.pixels and --env.repeat")
-    goals = [name for name in getattr(family, "relabels", ()) if name in family.parameters]
-    varied = getattr(family, "varied", ())
-    physical = [name for name in varied if name not in goals]
+    if reason := _why_not(env):
+        raise InputError(
+            f"hindsight cannot replay steps as another task's in this family: {reason}; or use --hindsight=0"
+        )
+
+
+def _why_not(family: Any) -> str:
+    """Return why steps of one task of a family cannot be another's; empty if they can."""
+    goals = [name for name in family.relabels if name in family.parameters] if isinstance(family, Relabelling) else []
     if not goals:
-        reason = "its rewards do not follow from a goal and from what is observed"
-    elif physical:
-        reason = f"{', '.join(physical)} changes what happens; vary nothing but {', '.join(goals)}"
-    elif not varied and not family.fresh_goals:
-        reason = f"its tasks have the same goal; vary {', '.join(goals)}"
-    else:
-        return
-    raise InputError(f"hindsight cannot replay steps as another task's in this family: {reason}; or use --hindsight=0")
+        return "its rewards do not follow from a goal and from what is observed"
+    if physical := [name for name in family.varied if name not in goals]:
+        return f"{', '.join(physical)} changes what happens; vary nothing but {', '.join(goals)}"
+    same = not family.varied and not family.fresh_goals
+    return f"its tasks have the same goal; vary {', '.join(goals)}" if same else ""
 
 
 Judge = Callable[[Transition], Array]
@@ -77,19 +79,18 @@ def sample(
     """
     source_key, row_key, task_key, goal_key = jax.random.split(key, 4)
     num_tasks, count = shape[0], max(round(share * shape[2]), 1)
-    again = (*shape[:2], count)
-    if judge is not None:
-        own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
-        rows = rings.sample_from(ring, row_key, own, window)
-        first = jax.tree.map(lambda x: x[:, :, :count], rows)
+    again, source = (*shape[:2], count), jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
+    if judge is None:
+        shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
+        source = source.at[:, :, :count].add(shift) % num_tasks
+    rows = rings.sample_from(ring, row_key, source, window)
+    first = jax.tree.map(lambda x: x[:, :, :count], rows)
+    if judge is None:
+        keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
+        of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
+        new = jax.vmap(of_task)(tasks, first, *keys)
+    else:
         new = relabel_inversely(env, tasks, first, task_key, goal_key, source_key, judge)
-        return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
-    shift = jax.random.randint(source_key, again, 0 if fresh_goals(env, tasks) else 1, num_tasks)
-    own = jnp.broadcast_to(jnp.arange(num_tasks)[:, None, None], shape)
-    rows = rings.sample_from(ring, row_key, own.at[:, :, :count].add(shift) % num_tasks, window)
-    keys = (jax.random.split(task_key, again), jax.random.split(goal_key, again))
-    of_task = jax.vmap(jax.vmap(partial(relabel, env), (None, 0, 0, 0)), (None, 0, 0, 0))
-    new = jax.vmap(of_task)(tasks, jax.tree.map(lambda x: x[:, :, :count], rows), *keys)
     return jax.tree.map(lambda new, rows: jnp.concatenate([new, rows[:, :, count:]], axis=2), new, rows)
 
 

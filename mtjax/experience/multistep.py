@@ -25,7 +25,7 @@ def length(cut: Array) -> Array:
     return 1 + jnp.sum(goes_on, axis=-1)
 
 
-def at(tree: Any, index: Array) -> Any:
+def take_steps(tree: Any, index: Array) -> Any:
     """Take entries ``index`` (..., n) along the axis of steps of leaves (..., W, ...)."""
     lead = index.ndim - 1
 
@@ -47,7 +47,7 @@ def join(steps: Transition, gamma: float | Array) -> Transition:
     powers = jnp.power(gamma, index)
     final = count - 1
     lead = steps.reward.ndim - 1
-    first, last = (jax.tree.map(lambda x: x.squeeze(lead), at(steps, index)) for index in (0 * final, final))
+    first, last = (jax.tree.map(lambda x: x.squeeze(lead), take_steps(steps, index)) for index in (0 * final, final))
     return first._replace(
         reward=jnp.sum(jnp.where(index < count, powers * steps.reward, 0.0), axis=-1),
         discount=powers[final.squeeze(-1)] * last.discount,

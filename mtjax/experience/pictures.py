@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.experience import multistep
-from mtjax.experience.multistep import at
+from mtjax.experience.multistep import take_steps
 from mtjax.frames import PICTURES, shown
 from mtjax.types import Array, Transition
 
@@ -41,8 +41,8 @@ def join(rows: Transition, gamma: float | Array, *, frames: int, n_step: int) ->
     cut = rows.cut & (rows.discount > 0)
     now = frames - cut[..., frames].astype(jnp.int32)
     bare = rows._replace(obs={name: x for name, x in rows.obs.items() if name != PICTURES})
-    body = at(bare, now[..., None] + jnp.arange(n_step))
-    stops = jnp.concatenate([at(cut, now[..., None] + jnp.arange(1, n_step)), cut[..., :1] & False], axis=-1)
+    body = take_steps(bare, now[..., None] + jnp.arange(n_step))
+    stops = jnp.concatenate([take_steps(cut, now[..., None] + jnp.arange(1, n_step)), cut[..., :1] & False], axis=-1)
     body = body._replace(cut=body.cut | stops)
     after = now + multistep.length(body.cut)
     joined = multistep.join(body, gamma) if n_step > 1 else jax.tree.map(lambda x: jnp.take(x, 0, now.ndim), body)
@@ -61,8 +61,9 @@ def followed(batch: Transition) -> Array | None:
 def stack(pictures: Array, ended: Array, place: Array, frames: int) -> Array:
     """Return the stack (..., H, W, N C) whose newest picture is at ``place`` (...) of pictures (..., W, H, W, C)."""
     back = jnp.arange(1, frames)
-    same = jnp.cumprod(~at(ended, place[..., None] - back), axis=-1)  # whether the step so far back is of this episode
+    ended_before = take_steps(ended, place[..., None] - back)
+    same = jnp.cumprod(~ended_before, axis=-1)  # whether the step so far back is of this episode
     age = jnp.sum(same, axis=-1, keepdims=True)
     steps = place[..., None] - jnp.minimum(jnp.arange(frames - 1, -1, -1), age)
-    found = at(pictures, steps)  # (..., N, H, W, C)
+    found = take_steps(pictures, steps)  # (..., N, H, W, C)
     return jnp.concatenate([found[..., i, :, :, :] for i in range(frames)], axis=-1)

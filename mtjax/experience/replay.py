@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import PartitionSpec
 
+from mtjax.checks import require_counts, require_not_negative
 from mtjax.experience import hindsight, multistep, pictures, store
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
@@ -89,13 +90,9 @@ class Replay:
             raise InputError(
                 f"hindsight-choice={self.hindsight_choice} relabels nothing with hindsight=0; give its share"
             )
-        for field in dataclasses.fields(self):
-            if field.name == "hindsight_choice":
-                continue
-            least = 0 if field.name in _MAY_BE_NONE else 1
-            if getattr(self, field.name) < least:
-                flag = field.name.replace("_", "-")
-                raise InputError(f"{flag} must be at least {least}, not {getattr(self, field.name)}")
+        others = [field.name for field in dataclasses.fields(self) if field.name not in _MAY_BE_NONE]
+        require_counts(self, *(name for name in others if name != "hindsight_choice"))
+        require_not_negative(self, *_MAY_BE_NONE)
         if self.n_step > self.warmup_steps + 1:
             raise InputError(
                 f"n-step={self.n_step} needs as many steps before the first update: warmup-steps of at least "

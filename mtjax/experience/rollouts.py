@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax import frames
+from mtjax.checks import require_counts
 from mtjax.types import Array, Env, InputError, Key, Spec, Storage, Task, Transition
 
 _LONGEST = 100_000
@@ -39,9 +40,7 @@ class Rollouts:
     def __post_init__(self):
         if not 1 <= self.unroll <= _LONGEST:
             raise InputError(f"unroll must be at least 1 and at most {_LONGEST}, not {self.unroll}")
-        for name in ("epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
+        require_counts(self, "epochs", "minibatches")
 
     @property
     def steps(self) -> int:

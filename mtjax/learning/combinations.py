@@ -5,11 +5,16 @@ from typing import Any
 import jax
 
 from mtjax import frames
-from mtjax.agents import BaseAgent
+from mtjax.agents import AGENTS, BaseAgent
+from mtjax.agents import name_of as agent_name_of
 from mtjax.agents.task_changes import consolidates
 from mtjax.envs import Family
+from mtjax.envs import name_of as env_name_of
+from mtjax.envs.choosing import Choosing
+from mtjax.envs.engines.base import World
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.loop import Settings
-from mtjax.types import Agent, Env, InputError
+from mtjax.types import Agent, Env, InputError, Returning
 
 
 def require_agent(settings: Settings, agent: Agent) -> None:
@@ -32,13 +37,12 @@ def require_agent(settings: Settings, agent: Agent) -> None:
 
 
 def require_env(settings: Settings, env: Env, agent: Agent) -> None:
-    """Check that a family has the worlds, the trials and the tasks at a time that settings and agent ask for.
+    """Check that a family has the worlds, actions, trials and tasks at a time that settings and agent ask for.
 
     Raises:
-        InputError: the replay does not fit it, its trials draw tasks to which the agent would adapt, its worlds cannot
-            go on, or some tasks of a mixture cannot be played alone.
+        InputError: its trials draw tasks to which the agent would adapt, its worlds cannot go on, some tasks of a
+            mixture cannot be played alone, the replay does not fit it, or the agent cannot draw its actions.
     """
-    agent.experience.check(env, settings.num_envs, settings.chunk_steps, agent.unroll)
     tasks = env.tasks("train")
     if agent.experience.adaptations and tasks.draws is not None:
         raise InputError("this agent adapts to each task by its rollouts, but here trials draw tasks; vary by a list")
@@ -48,6 +52,18 @@ def require_env(settings: Settings, env: Env, agent: Agent) -> None:
     _require_way_back(settings, env)
     if settings.plays.steps and tasks.blocks is not None:
         tasks.blocks.some(settings.plays.count(len(tasks.id)))
+    agent.experience.check(env, settings.num_envs, settings.chunk_steps, agent.unroll)
+    if isinstance(agent, BaseAgent) and not isinstance(agent.policy, agent.policies):
+        raise _draws_none(env, agent)
+
+
+def _draws_none(env: Env, agent: BaseAgent) -> InputError:
+    """Return the error of an agent that cannot draw a family's actions. It names agents that can."""
+    able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
+    families = [part.family for part in env.parts] if isinstance(env, FamilyOrMixture) else []
+    scores = ", or --env.scores" * any(isinstance(family, Choosing) for family in families)
+    names, kind = (agent_name_of(agent), env_name_of(env)), env.spec.action.kind
+    return InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
 
 
 def _require_turns(settings: Settings, agent: Agent) -> None:
@@ -72,7 +88,7 @@ def _require_way_back(settings: Settings, env: Any) -> None:
     told = f"the curriculum {settings.curriculum}"
     if not settings.reset_free:
         raise InputError(f"{told} is for worlds that are not reset; add --reset-free")
-    if not hasattr(env, "returning"):
+    if not isinstance(env, Returning):
         raise InputError(f"{told} needs a way back to the start, which this family has no task for, as tabletop has")
 
 
@@ -118,6 +134,6 @@ def _cannot_go_on(env: Env) -> str:
         return f"states depend on {', '.join(physical) or 'what episodes draw'}: only goals may be drawn"
     one = jax.tree.map(lambda x: x[0], tasks._replace(draws=None))
     state = jax.eval_shape(env.reset, one, jax.random.key(0)).state
-    if getattr(state, "extra", None) is not None or getattr(state, "mocap", None) is not None:
+    if isinstance(state, World) and (state.extra is not None or state.mocap is not None):
         return "the states of this family hold its goals"
     return "pictures show the goal of before" if frames.shown(env.spec.obs) else ""

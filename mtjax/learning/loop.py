@@ -17,7 +17,7 @@ from mtjax.agents.fit import reset_networks
 from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.swept import at_point, numbers_of, with_numbers
 from mtjax.agents.task_changes import change, consolidate, consolidates
-from mtjax.checks import check_fields
+from mtjax.checks import check_fields, require_counts
 from mtjax.learning import curricula
 from mtjax.learning.rollout import (
     EnvStep,
@@ -33,7 +33,7 @@ from mtjax.learning.rollout import (
 from mtjax.learning.trials import ResetFree, Trials, of_episodes
 from mtjax.parallel import collectives
 from mtjax.parallel.axes import over_seeds, when
-from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Sometimes, Task, Transition
+from mtjax.types import Agent, Array, Env, InputError, Key, Metrics, Task, Transition, Weighted
 
 PHASES = 10
 """Largest number of different first ages, as each causes a separate reset in every episode."""
@@ -75,9 +75,7 @@ class Settings:
 
     def __post_init__(self):
         check_fields(self)
-        for name in ("num_envs", "chunk_steps", "trials"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        require_counts(self, "num_envs", "chunk_steps", "trials")
         if self.reset_free and self.trials > 1:
             raise InputError(f"--reset-free has no episodes to repeat; use --trials=1, not {self.trials}")
         _ = self.trial, self.plays
@@ -257,7 +255,7 @@ def _consolidate(env: Env, agent: Agent, settings: Settings, known: Task, state:
     """Return the agents (S, ...) as they end the task that was played, from whose steps they may learn once more."""
     if not consolidates(agent):
         return state.agent
-    keys = _folded(state.key)
+    keys = jax.vmap(lambda key: jax.random.fold_in(key, _END))(state.key)
     fresh = lambda: jax.vmap(partial(_init_agent, env, agent, known))(keys, numbers_of(state.agent))
     if agent.continual.restarts:
         return fresh()
@@ -280,11 +278,6 @@ def _last_rollout(env: Env, agent: Agent, settings: Settings, tasks: Task, state
         return ()
     act_keys, reset_keys = split_keys(keys, 2)
     return _collect(env, agent, settings, tasks, state, act_keys, reset_keys)[1]
-
-
-def _folded(keys: Key) -> Key:
-    """Return keys (S,) for what happens where a task ends."""
-    return jax.vmap(lambda key: jax.random.fold_in(key, _END))(keys)
 
 
 def _of_played(learners: Any, rows: Array | None) -> Any:
@@ -493,7 +486,7 @@ def _summarise(history: dict, count: int) -> Metrics:
     for loss in jax.tree.leaves(losses):
         bad |= blameless & ~jnp.isfinite(loss).reshape(len(loss), 1, loss.shape[1], -1)
     means = jax.tree.map(mean, losses)
-    return {name: x.value / x.weight if isinstance(x, Sometimes) else x for name, x in means.items()} | {
+    return {name: x.mean if isinstance(x, Weighted) else x for name, x in means.items()} | {
         "episodes": episodes,
         "return": total / episodes,
         **{name: x / episodes for name, x in metrics.items()},

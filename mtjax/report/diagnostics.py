@@ -77,13 +77,8 @@ def with_experience(policy: Policy, directory: str | Path, point: int = 0) -> tu
     Raises:
         InputError: there are no diagnostics of such an agent, or no data.
     """
-    agent, name = policy.agent, type(policy.agent).__name__
-    if frames.shown(policy.env.spec.obs):
-        raise InputError("diagnostics are of agents whose networks take vectors")
-    if agent.losses is None:
-        raise InputError(f"diagnostics are of agents with losses of single steps, and those of {name} are not")
-    if agent.unroll:
-        raise InputError("diagnostics look at single transitions, and this agent learns from windows")
+    _require_single_steps(policy)
+    agent = policy.agent
     if agent.experience.storage.kept:
         return policy, *load_experience(directory, point)
     settings, tasks = from_json(Path(directory) / "config.json").training, policy.env.tasks("train")
@@ -91,6 +86,17 @@ def with_experience(policy: Policy, directory: str | Path, point: int = 0) -> tu
     states, steps = loop.rollout(policy.env, agent, settings, tasks, policy.states, keys)
     size = settings.num_envs * agent.experience.steps // agent.experience.minibatches
     return dataclasses.replace(policy, states=states), steps, size
+
+
+def _require_single_steps(policy: Policy) -> None:
+    """Refuse agents that see pictures, or learn from more than single steps."""
+    agent, name = policy.agent, type(policy.agent).__name__
+    if frames.shown(policy.env.spec.obs):
+        raise InputError("diagnostics are of agents whose networks take vectors")
+    if agent.losses is None:
+        raise InputError(f"diagnostics are of agents with losses of single steps, and those of {name} are not")
+    if agent.unroll:
+        raise InputError("diagnostics look at single transitions, and this agent learns from windows")
 
 
 def diagnose(policy: Policy, data: Any, batch_size: int) -> Diagnostics:
@@ -101,8 +107,9 @@ def diagnose(policy: Policy, data: Any, batch_size: int) -> Diagnostics:
         batch_size: transitions of a task in each batch. The run's own size gives the gradient norms of training.
 
     Raises:
-        InputError: the replay is empty.
+        InputError: there are no diagnostics of such an agent, or the replay is empty.
     """
+    _require_single_steps(policy)
     tasks, agent = policy.env.tasks("train"), policy.agent
     kept = agent.experience.storage.kept
     if kept and int(data.size) < agent.experience.n_step:

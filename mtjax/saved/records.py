@@ -26,7 +26,7 @@ class Records:
         self.checkpoints = Path() if directory is None else directory / "checkpoints"
         self.writer = None if directory is None else checkpoint.Writer(self.checkpoints)
 
-    def found(self, resume: bool) -> bool:
+    def resumes(self, resume: bool) -> bool:
         """Return whether there is a checkpoint to resume from. Every process must call this.
 
         Raises:

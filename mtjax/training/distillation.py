@@ -18,7 +18,7 @@ from mtjax.envs.contexts import ranges
 from mtjax.saved import pretrained
 from mtjax.saved.policy import Policy
 from mtjax.tasks import SAME_CONTEXT
-from mtjax.training.finetune import describe_actions, describe_sizes, require_same_agent
+from mtjax.training.finetune import describe_actions, describe_sizes, require_same_agent, require_shapes
 from mtjax.types import Env, InputError, Task
 
 _SAME = 1e-6  # relative difference of parameters of one task, which are float32
@@ -129,9 +129,5 @@ def adopt(starts: Sequence[Policy], agent: BaseAgent, tasks: Task, fresh: Any) -
     of_seeds = lambda start: jax.tree.map(lambda x: x[jnp.arange(count) % len(start.seeds)], start.states)
     states = [of_seeds(start)._replace(fits={}, numbers={}) for start in starts]
     net = jax.vmap(lambda *states: teachers.join(states, *map(jnp.asarray, found)))(*states)
-    pairs = zip(jax.tree.leaves_with_path(net), jax.tree.leaves(fresh.nets["teacher"]), strict=True)
-    for (place, ours), expected in pairs:
-        if ours.shape != expected.shape:
-            name = jax.tree_util.keystr(place)
-            raise InputError(f"the teacher's networks do not fit: {name} is {ours.shape[1:]}, not {expected.shape[1:]}")
+    require_shapes("teacher", net, fresh.nets["teacher"])
     return fresh.with_nets(teacher=net)

@@ -123,12 +123,17 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
     of_seeds = lambda states: jax.tree.map(lambda x: x[seeds], states)
     adopt_all = lambda states, fresh: jax.vmap(partial(_adopt, agent, tasks))(of_seeds(states), fresh)
     state = jax.jit(adopt_all)(start.states, fresh)
-    pairs = zip(jax.tree.leaves_with_path(state), jax.tree.leaves(fresh), strict=True)
+    require_shapes("run", state, fresh)
+    return state
+
+
+def require_shapes(whose: str, networks: Any, fresh: Any) -> None:
+    """Refuse adopted networks (S, ...) that are not as large as ``fresh`` ones."""
+    pairs = zip(jax.tree.leaves_with_path(networks), jax.tree.leaves(fresh), strict=True)
     for (path, ours), expected in pairs:
         if ours.shape != expected.shape:
             name = jax.tree_util.keystr(path)
-            raise InputError(f"the run's networks do not fit: {name} is {ours.shape[1:]}, not {expected.shape[1:]}")
-    return state
+            raise InputError(f"the {whose}'s networks do not fit: {name} is {ours.shape[1:]}, not {expected.shape[1:]}")
 
 
 def _adopt(agent: BaseAgent, tasks: Task, old: AgentState, fresh: AgentState) -> AgentState:

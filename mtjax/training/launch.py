@@ -7,13 +7,11 @@ from typing import Any
 
 import jax
 
-from mtjax.agents import AGENTS, BaseAgent, preset_of
-from mtjax.agents import name_of as agent_name_of
+from mtjax.agents import preset_of
 from mtjax.agents.combinations import require_sight
 from mtjax.checks import require_library
 from mtjax.config import RunConfig
 from mtjax.envs import Family
-from mtjax.envs import name_of as env_name_of
 from mtjax.envs.contexts import ranges
 from mtjax.envs.task_table import forgetful
 from mtjax.frames import shown
@@ -47,7 +45,6 @@ def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> 
     if config.env:
         _require_named(config)
     combinations.require_env(config.played, family, learner)
-    _require_policy(learner, family)
     if config.mesh is not None and (lost := forgetful(family)):
         raise InputError(
             f"{lost} steps on the host of one device, and this run is on {config.mesh.size}; show JAX one, such "
@@ -68,21 +65,6 @@ def _require_named(config: RunConfig) -> None:
             "use --agent=sac-conditioned, to which --agent.representation=encoded adds an encoder"
         )
     learner.conditioning.table(family.spec, family.train_count)
-
-
-def _require_policy(agent: Any, env: Any) -> None:
-    """Refuse an agent that cannot draw the actions of its environment.
-
-    Raises:
-        InputError: that is so; it names agents that can.
-    """
-    if not isinstance(agent, BaseAgent) or isinstance(agent.policy, agent.policies):
-        return
-    able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
-    scored = any(hasattr(part.family, "scores") for part in getattr(env, "parts", ()))
-    scores, kind = ", or --env.scores" if scored else "", env.spec.action.kind
-    names = agent_name_of(agent), env_name_of(env)
-    raise InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
 
 
 def load_start(config: RunConfig) -> Policy | tuple[Policy, ...] | None:

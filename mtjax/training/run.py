@@ -96,7 +96,7 @@ class _Run:
         with contextlib.ExitStack() as held:
             if (folder := self.hooks.directory) is not None:
                 hosts.by_first(lambda: held.enter_context(lock.hold(folder)))()
-            resumed = self.journal.records.found(self.hooks.resume)
+            resumed = self.journal.records.resumes(self.hooks.resume)
             if self.hooks.resume and not resumed:
                 self.journal.console.say("there is no checkpoint yet, so the run starts over")
             if not resumed:

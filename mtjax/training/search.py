@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mtjax.agents.swept import Point
 from mtjax.checks import require_library
 from mtjax.names import InputError, replacing
 
@@ -110,7 +109,7 @@ def ask(search: Search) -> Search:
     sampler = optuna.samplers.TPESampler(seed=search.seed + begun, n_startup_trials=startup, constant_liar=True)
     study, space = optuna.create_study(sampler=sampler, direction="maximize"), _space(search)
     study.add_trials([_told(optuna, trial, space) for trial in search.trials])
-    if not begun and _contains(search.ranges, search.preset):
+    if not begun and all(low <= search.preset[name] <= high for name, (low, high) in search.ranges.items()):
         study.enqueue_trial(dict(search.preset))
     size = min(search.batch, search.count - begun)
     asked = [study.ask(space).params for _ in range(size)]
@@ -132,10 +131,6 @@ def _told(optuna: Any, trial: Trial, space: Mapping[str, Any]) -> Any:
         return optuna.create_trial(value=last_return(trial), **about)
     known = {} if trial.state == DIVERGED else trial.returns
     return optuna.create_trial(state=states.PRUNED, intermediate_values=known, **about)
-
-
-def _contains(ranges: Mapping[str, tuple[float, float]], values: Mapping[str, float]) -> bool:
-    return all(low <= values[name] <= high for name, (low, high) in ranges.items())
 
 
 def _rounded(search: Search, values: Mapping[str, float]) -> dict[str, float]:
@@ -190,8 +185,3 @@ def read(folder: Path) -> Search:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         text = f"{str(folder / FILE)!r} does not describe a search: {type(error).__name__}: {error}"
         raise InputError(text) from None
-
-
-def points(search: Search) -> tuple[Point, ...]:
-    """Return the points of the running trials."""
-    return tuple(trial.values for trial in search.running)

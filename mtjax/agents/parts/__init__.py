@@ -7,12 +7,20 @@ An agent has one part of each kind. A part's fields are flags of the agent on th
 import copy
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
-from mtjax.checks import checked, require_text, shown
+from mtjax.checks import checked, shown
+from mtjax.checks import require_choices as require_choices  # re-exported for parts of one's own, as are the next
+from mtjax.checks import require_counts as require_counts
+from mtjax.checks import require_layers as require_layers
+from mtjax.checks import require_not_negative as require_not_negative
+from mtjax.checks import require_positive as require_positive
+from mtjax.checks import require_rates as require_rates
+from mtjax.checks import require_shares as require_shares
+from mtjax.checks import require_widths as require_widths
 from mtjax.names import frozen, nearest_error
 from mtjax.types import InputError
 
@@ -76,69 +84,3 @@ def limit(value: Any) -> Any:
     if is_zero(value):
         return None
     return jnp.where(value > 0, value, jnp.inf) if isinstance(value, jax.Array) else value
-
-
-# Checks of settings. Each raises an InputError that names the setting, its value and what is allowed.
-
-
-def require_choices(holder: Any) -> None:
-    """Require every setting of ``Literal`` type to be one of its choices."""
-    for field in dataclasses.fields(holder):
-        allowed = get_args(field.type) if get_origin(field.type) is Literal else ()
-        value = getattr(holder, field.name)
-        if allowed:
-            require_text(value, field.name)
-        if allowed and value not in allowed:
-            raise nearest_error(_flag(field.name), value, allowed)
-
-
-def require_positive(holder: Any, *names: str) -> None:
-    """Require numbers greater than 0."""
-    for name in names:
-        _require(getattr(holder, name) > 0, holder, name, "must be greater than 0")
-
-
-def require_not_negative(holder: Any, *names: str) -> None:
-    """Require numbers of at least 0."""
-    for name in names:
-        _require(getattr(holder, name) >= 0, holder, name, "must be at least 0")
-
-
-def require_rates(holder: Any, *names: str) -> None:
-    """Require numbers in (0, 1]."""
-    for name in names:
-        _require(0 < getattr(holder, name) <= 1, holder, name, "must be in (0, 1]")
-
-
-def require_shares(holder: Any, *names: str) -> None:
-    """Require numbers in [0, 1]."""
-    for name in names:
-        _require(0 <= getattr(holder, name) <= 1, holder, name, "must be in [0, 1]")
-
-
-def require_counts(holder: Any, *names: str) -> None:
-    """Require numbers of at least 1."""
-    for name in names:
-        _require(getattr(holder, name) >= 1, holder, name, "must be at least 1")
-
-
-def require_layers(holder: Any, *names: str) -> None:
-    """Require widths of at least one layer, of at least one unit each."""
-    for name in names:
-        widths = getattr(holder, name)
-        _require(widths and min(widths) >= 1, holder, name, "needs at least one layer of at least one unit")
-
-
-def require_widths(holder: Any, *names: str) -> None:
-    """Require widths of at least one unit each; there may be no layers."""
-    for name in names:
-        _require(all(width >= 1 for width in getattr(holder, name)), holder, name, "must be of at least one unit each")
-
-
-def _require(met: Any, holder: Any, name: str, rule: str) -> None:
-    if not met:
-        raise InputError(f"{_flag(name)} {rule}, not {getattr(holder, name)}")
-
-
-def _flag(name: str) -> str:
-    return name.replace("_", "-")

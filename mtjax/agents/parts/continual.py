@@ -92,8 +92,11 @@ def _no_anchor(self: Nothing, actor: Params, num_tasks: int, example: tuple, siz
     return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
 
-def _penalty(nets: Nets, coefficient: float) -> Array:
-    return forgetting.penalty(nets[NET].shared["anchor"], nets["actor"].shared, coefficient)
+def _pulled_by(coefficient: Callable[[Any], float]) -> Callable[..., Array]:
+    """Return the ``penalty`` of a way, by what is its coefficient."""
+    return lambda self, nets, agent, key: forgetting.penalty(
+        nets[NET].shared["anchor"], nets["actor"].shared, coefficient(self)
+    )
 
 
 def _hold(nets: Nets, importance: Any) -> Nets:
@@ -112,10 +115,7 @@ class L2(Nothing):
     def __post_init__(self):
         parts.require_not_negative(self, "l2_coefficient")
 
-    init = _no_anchor
-
-    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
-        return _penalty(nets, self.l2_coefficient)
+    init, penalty = _no_anchor, _pulled_by(lambda self: self.l2_coefficient)
 
     def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
         return _hold(nets, forgetting.l2(nets["actor"].shared))
@@ -137,10 +137,7 @@ class EWC(Nothing):
         parts.require_not_negative(self, "ewc_coefficient", "fisher_least")
         _require_group(self, "fisher_samples")
 
-    init = _no_anchor
-
-    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
-        return _penalty(nets, self.ewc_coefficient)
+    init, penalty = _no_anchor, _pulled_by(lambda self: self.ewc_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
@@ -165,10 +162,7 @@ class MAS(Nothing):
         parts.require_not_negative(self, "mas_coefficient")
         _require_group(self, "mas_samples")
 
-    init = _no_anchor
-
-    def penalty(self, nets: Nets, agent: Any, key: Key) -> Array:
-        return _penalty(nets, self.mas_coefficient)
+    init, penalty = _no_anchor, _pulled_by(lambda self: self.mas_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]

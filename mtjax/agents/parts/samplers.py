@@ -5,7 +5,7 @@ weigh its losses by two: the same in expectation, and less noisy.
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from mtjax.types import Array, InputError, Transition
 class Uniform:
     """Weighs all tasks equally. Every sampler is a class with these methods."""
 
+    by_temperature: ClassVar[bool] = False  # whether it weighs tasks by the temperatures that SAC has
     init, begin, remember, observe = Watcher.init, Watcher.begin, Watcher.remember, Watcher.observe
 
     def weights(self, memory: Any, temperature: Array) -> Array | None:
@@ -207,6 +208,7 @@ class ByTemperature(Uniform):
     ``least_weight=0`` removes it.
     """
 
+    by_temperature: ClassVar[bool] = True
     least_weight: float = 0.1
     """Weight that every task has at least; the rest is divided by the sampler. 1 weighs all tasks equally."""
     certainty: Literal["log-temperature", "temperature"] = "log-temperature"

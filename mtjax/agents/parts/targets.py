@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.parts.policies import Drawn
+from mtjax.agents.parts.policies import Drawn, Taken
 from mtjax.types import Array, Transition
 
 
@@ -138,13 +138,6 @@ class TD:
         return jnp.zeros_like(q)
 
 
-class Behaviour(NamedTuple):
-    """Holds what is kept of the policy that took an action."""
-
-    raw: Array  # the action as ``Policy.log_prob`` takes it
-    log_prob: Array  # () its log-probability
-
-
 @dataclasses.dataclass(frozen=True)
 class Retrace(TD):
     """The target sums later rewards as far as the present policy would have acted as the older one (Munos et al. 2016).
@@ -176,8 +169,8 @@ class Retrace(TD):
     def window(self) -> int:
         return self.retrace_steps
 
-    def keep(self, drawn: Drawn) -> Behaviour:
-        return Behaviour(drawn.raw, drawn.log_prob)
+    def keep(self, drawn: Drawn) -> Taken:
+        return Taken(drawn.raw, drawn.log_prob)
 
     def beyond(self, steps: Transition, q: Array, next_value: Array, log_ratio: Array) -> Array:
         return corrections(steps, q, next_value, log_ratio, 1.0, self.retrace_lambda)

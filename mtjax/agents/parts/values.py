@@ -1,6 +1,7 @@
 """Kinds of value interpret a critic's outputs as a number, or as a distribution over returns."""
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +18,11 @@ class Scalar:
     Every kind of value is a class with these methods. Outputs of N critics have a leading N.
     """
 
+    linear: ClassVar[bool] = True
+    """Whether values are linear in a critic's outputs, so that its head can be rescaled."""
+
     def refuses(self, scaling: str) -> str:
-        """Return why this kind of value cannot work with a scaling of rewards; empty if it can."""
+        """Return why this kind of value cannot work with a scaling that keeps returns in no range; empty if it can."""
         return ""
 
     @property
@@ -64,6 +68,7 @@ class C51(Scalar):
     given, as the critic cannot represent returns beyond it.
     """
 
+    linear: ClassVar[bool] = False
     num_bins: int = 101
     """Number of atoms, or bins, of the distribution over returns."""
     value_low: float = -10.0
@@ -78,8 +83,7 @@ class C51(Scalar):
             raise InputError(f"value-low must be below value-high, not {self.value_low} and {self.value_high}")
 
     def refuses(self, scaling: str) -> str:
-        given = (self.value_low, self.value_high) != (C51.value_low, C51.value_high)
-        if given or scaling in ("return", "return-std"):
+        if (self.value_low, self.value_high) != (C51.value_low, C51.value_high):
             return ""
         return (
             f"reaches returns from {self.value_low:g} to {self.value_high:g}, and scaling={scaling} does not keep them "

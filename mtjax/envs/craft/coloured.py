@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mtjax.checks import require_not_negative
 from mtjax.envs.craft.grid import MOVES
 from mtjax.envs.looks import Look
 from mtjax.envs.mtenv.tabular import DrawnTasks
@@ -87,9 +88,7 @@ class ColouredMaze(Pictured, DrawnTasks):
                 raise InputError(f"{flag} must be from {least} to {most}, not {getattr(self, name)}")
         if self.pixels and self.cells > _MOST_SEEN:
             raise InputError(f"pictures show at most {_MOST_SEEN} x {_MOST_SEEN} squares, not cells={self.cells}")
-        for name in ("spread", "noise"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"{name} must be at least 0, not {getattr(self, name)}")
+        require_not_negative(self, "spread", "noise")
 
     # Tasks.
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.checks import require_counts
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.contexts import goals
 from mtjax.envs.family import Family
@@ -63,8 +64,7 @@ class Sketched(Pictured, Choosing, Family):
             raise InputError(f"held-out names tasks, such as {next(iter(self.sketches))}; there is no {unknown[0]}")
         if self.split == "dense" and not self.variation.counts["train"]:
             raise InputError("held-out leaves no task to train on; name fewer, or use --split=none")
-        if self.symbol_steps < 1:
-            raise InputError(f"symbol-steps must be at least 1, not {self.symbol_steps}")
+        require_counts(self, "symbol_steps")
         if self.sketched and self.pixels:
             raise InputError("pictures do not show the symbol that is due; leave out --env.sketched or --env.pixels")
 

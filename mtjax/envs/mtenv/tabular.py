@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.checks import require_counts
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import REWARD_SCALE, Parameter
@@ -196,8 +197,7 @@ class Bandit(DrawnTasks):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.num_arms < 1:
-            raise InputError(f"num-arms must be at least 1, not {self.num_arms}")
+        require_counts(self, "num_arms")
 
     @property
     def action_size(self) -> int:  # type: ignore[override]

@@ -35,7 +35,7 @@ def schedule(rate: Any, shape: Shape, final: Any, warmup: float, updates: float)
         cosine      rate (f + (1 - f) (1 + cos(pi p)) / 2)      (Loshchilov & Hutter 2017, "SGDR", without restarts)
     """
 
-    def at(count: Array) -> Array:
+    def rate_at(count: Array) -> Array:
         rising = jnp.minimum((count + 1) / max(warmup, 1), 1)
         if shape == "constant":
             return rate * rising
@@ -48,7 +48,7 @@ def schedule(rate: Any, shape: Shape, final: Any, warmup: float, updates: float)
         left = 1 - progress if shape == "linear" else (1 + jnp.cos(jnp.pi * progress)) / 2
         return rate * rising * (final + (1 - final) * left)
 
-    return at
+    return rate_at
 
 
 def _learning(tune: str, params: Params) -> Any:

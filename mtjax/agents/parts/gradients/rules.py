@@ -153,13 +153,13 @@ class CAGrad(Mean):
         shortest = jnp.min(lengths)
         budget = present * shortest / norms
 
-        def at(multiplier: Array) -> tuple[Array, Array]:
+        def solve(multiplier: Array) -> tuple[Array, Array]:
             x = minimise(matrix, slope, multiplier * budget)
             return x, jnp.sqrt(x @ matrix @ x)
 
         def narrow(bracket: Array, _) -> tuple[Array, tuple[Array, Array]]:
             multipliers = jnp.geomspace(bracket[0], bracket[1], CAGRAD_GRID)
-            x, reach = jax.vmap(at)(multipliers)
+            x, reach = jax.vmap(solve)(multipliers)
             high = jnp.clip(jnp.sum(reach > radius), 1, CAGRAD_GRID - 1)
             pair = jnp.stack([high - 1, high])
             return multipliers[pair], (x[pair], reach[pair])

@@ -66,7 +66,7 @@ class Nothing:
         """
         return hidden
 
-    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+    def task_vector(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
         """Return those features (Z,) of a task that need no learned parameters.
 
         Args:
@@ -74,15 +74,15 @@ class Nothing:
         """
         return jnp.zeros(0)
 
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+    def features(self, params: dict[str, Any], task_vector: Array, seen: Any) -> Array:
         """Return the features (Z,) or (..., Z) of one task that networks take as inputs.
 
         Args:
             params: the named parts of ``knowing``, of this task.
-            given: from ``given``, (Z,) or (..., Z).
+            task_vector: from the method of that name, (Z,) or (..., Z).
             seen: observations (..., O), with the last steps if there is a ``history``.
         """
-        return given
+        return task_vector
 
     def join(self, loss: Array, metrics: Metrics, params: dict[str, Any], seen: Any) -> tuple[Array, Metrics]:
         """Add what it learns by to the critics' loss of one task, and its metrics to theirs.

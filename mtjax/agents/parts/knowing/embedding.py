@@ -34,7 +34,7 @@ class Embedding(Nothing):
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         return Params({}, {"embedding": jax.random.normal(key, (num_tasks, self.embedding_size))})
 
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+    def features(self, params: dict[str, Any], task_vector: Array, seen: Any) -> Array:
         vector = params["embedding"]
         return unit(vector) if self.unit_embedding else vector
 

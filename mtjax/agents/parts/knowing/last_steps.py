@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.networks import MLP, Network, Params
+from mtjax.agents.networks import MLP, Params, init_params
 from mtjax.agents.parts.knowing.base import Nothing
 from mtjax.types import Array, Key
 
@@ -102,9 +102,7 @@ class LastSteps(Nothing):
         return TrajectoryEncoder(self.embedding_size)
 
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
-        if own:
-            return Params({}, {"trajectory": Network.for_each_task(self.encoder.init, key, num_tasks, seen)})
-        return Params({"trajectory": self.encoder.init(key, seen)}, {})
+        return init_params(lambda key: {"trajectory": self.encoder.init(key, seen)}, own, key, num_tasks)
 
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+    def features(self, params: dict[str, Any], task_vector: Array, seen: Any) -> Array:
         return self.encoder.apply(params["trajectory"], seen)  # type: ignore

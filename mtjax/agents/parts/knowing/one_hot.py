@@ -17,5 +17,5 @@ class OneHot(Nothing):
     tells: ClassVar[bool] = True
     by_number: ClassVar[bool] = True
 
-    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+    def task_vector(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
         return jax.nn.one_hot(number, num_tasks)

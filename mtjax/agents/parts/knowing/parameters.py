@@ -24,7 +24,7 @@ class Parameters(Nothing):
     def __post_init__(self):
         parts.require_not_negative(self, "context_limit")
 
-    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+    def task_vector(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
         return self.limited(task.context)
 
     def limited(self, context: Array) -> Array:

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 import jax
 
 from mtjax.agents import parts
-from mtjax.agents.networks import Network, Params
+from mtjax.agents.networks import Params, init_params
 from mtjax.agents.parts.knowing.inference import INFERENCES, Inference
 from mtjax.agents.parts.knowing.recurrent import Remembering
 from mtjax.types import Array, Key, Metrics
@@ -84,7 +84,7 @@ class Posterior(Remembering):
             keys = jax.random.split(key, len(modules))
             return {name: module.init(k, *x) for k, (name, (module, *x)) in zip(keys, modules.items(), strict=True)}
 
-        return Params({}, Network.for_each_task(init, key, num_tasks)) if own else Params(init(key), {})
+        return init_params(init, own, key, num_tasks)
 
     def begin(self, obs_size: int, action_size: int) -> Array:
         return self.way.begin(obs_size, action_size)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.networks import Network, Params, orthogonal
+from mtjax.agents.networks import Params, init_params, orthogonal
 from mtjax.agents.parts.knowing.base import Nothing
 from mtjax.types import Array, Key, Transition
 
@@ -52,8 +52,8 @@ class Remembering(Nothing):
     It learns through the steps of a window, which begins with the memory that acting had there. That does not learn.
     Parameters have changed since, so a window of a replay may have steps in front, after which the memory is that of
     the present parameters, or of the slow ones in targets, and nothing learns (burn-in; Kapturowski et al. 2019,
-    "R2D2"). A subclass says with which memory a trial begins, what is read of a step, how the memory changes, and what
-    is shown.
+    "R2D2"). A subclass says with which memory a trial begins and how it changes, and may say what is read of a step and
+    what is shown.
     """
 
     recurrent_steps: int = 16
@@ -68,9 +68,9 @@ class Remembering(Nothing):
         parts.require_counts(self, "recurrent_steps")
         parts.require_not_negative(self, "burn_in")
 
-    @abc.abstractmethod
     def read(self, params: dict[str, Any], step: Any) -> Array:
         """Return what is read (..., I) of steps: transitions or a ``Track``."""
+        return inputs(step.obs, step.action, step.reward, step.ended)
 
     @abc.abstractmethod
     def advance(self, params: dict[str, Any], memory: Any, read: Array) -> Any:
@@ -83,7 +83,7 @@ class Remembering(Nothing):
     def remember(self, params: dict[str, Any], hidden: Any, step: Transition) -> Any:
         return self.advance(params, hidden, self.read(params, step))
 
-    def features(self, params: dict[str, Any], given: Array, seen: Any) -> Array:
+    def features(self, params: dict[str, Any], task_vector: Array, seen: Any) -> Array:
         if isinstance(seen.past, Hidden):
             return self.show(params, seen.past.state)
         track = self.burned_in(params, seen.past)
@@ -167,16 +167,11 @@ class Recurrent(Remembering):
 
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         read = inputs(seen.obs, action, jnp.float32(0), jnp.bool_(False))
-        init = lambda key: self.cell.init(key, jnp.zeros(self.recurrent_size), read)["params"]
-        if own:
-            return Params({}, {"recurrent": Network.for_each_task(init, key, num_tasks)})
-        return Params({"recurrent": init(key)}, {})
+        init = lambda key: {"recurrent": self.cell.init(key, jnp.zeros(self.recurrent_size), read)["params"]}
+        return init_params(init, own, key, num_tasks)
 
     def begin(self, obs_size: int, action_size: int) -> Array:
         return jnp.zeros(self.recurrent_size)
-
-    def read(self, params: dict[str, Any], step: Any) -> Array:
-        return inputs(step.obs, step.action, step.reward, step.ended)
 
     def advance(self, params: dict[str, Any], memory: Array, read: Array) -> Array:
         return self.cell.apply({"params": params["recurrent"]}, memory, read)[0]  # type: ignore

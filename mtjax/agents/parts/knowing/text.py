@@ -32,7 +32,7 @@ class Text(Nothing):
     def table(self, spec: Spec, num_tasks: int) -> Array:
         return jnp.asarray(encode(self.text, spec.sentences))
 
-    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+    def task_vector(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
         assert table is not None
         return table[jnp.where(task.id < len(table), task.id, number)]
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mtjax.agents import parts
-from mtjax.agents.networks import Network, Params, ReLU
+from mtjax.agents.networks import Params, ReLU, init_params
 from mtjax.agents.parts.knowing.recurrent import Remembering, Track, inputs
 from mtjax.types import Array, InputError, Key
 
@@ -152,19 +152,14 @@ class Transformer(Remembering):
 
     def init(self, num_tasks: int, seen: Any, action: Array, own: bool, key: Key) -> Params:
         read = inputs(seen.obs, action, jnp.float32(0), jnp.bool_(False))[None, None]
-        given = self.begin(len(seen.obs), len(action)), read, jnp.zeros(1)
-        init = lambda key: self.blocks.init(key, *given)["params"]
-        if own:
-            return Params({}, {"transformer": Network.for_each_task(init, key, num_tasks)})
-        return Params({"transformer": init(key)}, {})
+        first = self.begin(len(seen.obs), len(action)), read, jnp.zeros(1)
+        init = lambda key: {"transformer": self.blocks.init(key, *first)["params"]}
+        return init_params(init, own, key, num_tasks)
 
     def begin(self, obs_size: int, action_size: int) -> Cache:
         """Return the memory of no step."""
         of_steps = jnp.zeros((self.transformer_layers, self.attended_steps, self.transformer_size))
         return Cache(of_steps, of_steps, jnp.zeros(self.attended_steps), jnp.zeros(self.transformer_size))
-
-    def read(self, params: dict[str, Any], step: Any) -> Array:
-        return inputs(step.obs, step.action, step.reward, step.ended)
 
     def advance(self, params: dict[str, Any], memory: Cache, read: Array) -> Cache:
         out, keys, values = self.apply(params, memory, read[..., None, None, :], jnp.zeros((*read.shape[:-1], 1)))

@@ -26,7 +26,7 @@ class Vectors(Nothing):
     def table(self, spec: Spec, num_tasks: int) -> Array:
         return load_vectors(self.vectors, num_tasks)
 
-    def given(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
+    def task_vector(self, number: Array, task: Task, num_tasks: int, table: Array | None) -> Array:
         assert table is not None
         return table[number]
 

@@ -3,7 +3,7 @@
 To add a kind of actions, add its class to ``mtjax.types``, and a file and a line here.
 """
 
-from mtjax.agents.parts.policies.base import Drawn, Policy
+from mtjax.agents.parts.policies.base import Drawn, Policy, Taken
 from mtjax.agents.parts.policies.categorical import Categorical
 from mtjax.agents.parts.policies.gaussian import Gaussian
 from mtjax.agents.parts.policies.multi_categorical import MultiCategorical
@@ -21,4 +21,4 @@ def policy_for(action: Action) -> Policy:
             return MultiCategorical(action)
 
 
-__all__ = ["Categorical", "Drawn", "Gaussian", "MultiCategorical", "Policy", "policy_for"]
+__all__ = ["Categorical", "Drawn", "Gaussian", "MultiCategorical", "Policy", "Taken", "policy_for"]

@@ -17,6 +17,13 @@ class Drawn(NamedTuple):
     log_prob: Array  # (...,) its log-probability; 0 for the mode of a Gaussian
 
 
+class Taken(NamedTuple):
+    """Holds what is stored with an action when it is taken."""
+
+    raw: Array  # as ``log_prob`` takes it
+    log_prob: Array  # () its log-probability under the policy that took it
+
+
 @dataclasses.dataclass(frozen=True)
 class Policy(abc.ABC):
     """Reads the outputs (..., P) of an actor as a distribution over actions.

@@ -23,12 +23,7 @@ class MultiCategorical(Policy):
     """
 
     actions: MultiDiscrete
-
-    def outputs(self, size: int) -> int:
-        return size
-
-    def first(self, size: int, std: float | Array) -> Array:
-        return jnp.zeros(size)
+    outputs, first, action = Categorical.outputs, Categorical.first, Categorical.action
 
     def blank(self, nets: Mapping[str, Params]) -> Array:
         return self.actions.blank()
@@ -43,9 +38,6 @@ class MultiCategorical(Policy):
         drawn = [choice.draw(logits, there, part_key) for (choice, logits, there), part_key in parts]
         action = jnp.concatenate([part.action for part in drawn], axis=-1)
         return Drawn(action, action, _sum([part.log_prob for part in drawn]))
-
-    def action(self, raw: Array, mask: Array | None) -> Array:
-        return raw
 
     def log_prob(self, outputs: Array, raw: Array, mask: Array | None = None) -> Array:
         parts = zip(self._parts(outputs, mask), self.actions.split(raw), strict=True)

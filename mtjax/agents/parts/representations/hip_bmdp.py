@@ -12,7 +12,7 @@ from mtjax.agents.networks import Params, join
 from mtjax.agents.parts.knowing.embedding import unit
 from mtjax.agents.parts.knowing.last_steps import TrajectoryEncoder
 from mtjax.agents.parts.representations.base import Unseen
-from mtjax.agents.parts.representations.deepmdp import DeepMDP, Dynamics, ModelTargets, Transitions, require_one_sense
+from mtjax.agents.parts.representations.deepmdp import DeepMDP, ModelTargets, Transitions
 from mtjax.agents.parts.representations.encoded import Encoded, encode_tasks
 from mtjax.types import Array, Key, Metrics
 
@@ -85,16 +85,8 @@ class HiPBMDP(Encoded):
     def history(self) -> int:  # type: ignore[override]
         return self.theta_from if self.unseen_theta == "inferred" else 0
 
-    @property
-    def dynamics(self) -> Dynamics:
-        """The models of latent states and rewards, as in DeepMDP."""
-        return Dynamics(self.model_widths, self.latent_widths[-1], self.transition)
-
-    def model_inputs(self, latent: Array, features: Array, action: Array) -> dict[str, tuple]:
-        return self.dynamics.inputs(latent, features, action)
-
-    def require(self, obs: Any) -> None:
-        require_one_sense(obs)
+    dynamics, model_inputs = DeepMDP.dynamics, DeepMDP.model_inputs
+    require, least_loss = DeepMDP.require, DeepMDP.least_loss  # type: ignore
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -154,10 +146,6 @@ class HiPBMDP(Encoded):
         error = self.apply(params, "guess", batch.obs) - jax.lax.stop_gradient(params.own["embedding"])
         guess_loss = jnp.mean(jnp.sum(jnp.square(error), axis=-1))
         return loss + guess_loss, metrics | {"guess_loss": guess_loss}
-
-    @property
-    def least_loss(self) -> float | Array:  # type: ignore[override]
-        return self.model_coefficient * self.dynamics.least_loss
 
     def theta_loss(self, params: Params, features: Array, obs: Any, action: Array, other_theta: Array) -> Array:
         """Compute the theta loss (B,) of one task and another task's vector (Z,)."""

@@ -15,6 +15,9 @@ class NoScaling:
     """Leaves rewards as they are. Every scaling is a class with these methods."""
 
     follows_resets: ClassVar[bool] = False  # whether its units are renewed by resets of networks alone
+    discounted: ClassVar[bool] = False  # whether its units follow from a bound of discounted returns
+    fits_returns: ClassVar[bool] = False  # whether it keeps returns in a range
+    rescales: ClassVar[bool] = False  # whether it rescales the heads of critics, each task's own, as values move
     init, begin, remember, observe = Watcher.init, Watcher.begin, Watcher.remember, Watcher.observe
 
     def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,6 @@ from mtjax.agents.networks import Params
 from mtjax.agents.parts.scaling.base import Moments, NoScaling
 from mtjax.types import Array, Transition
 
-_LEARNING = -1.0
-
 
 class Estimates(NamedTuple):
     """Holds the moments of targets, and before there are any the mean square of rewards in their place."""
@@ -21,7 +19,8 @@ class Estimates(NamedTuple):
     mean: Array  # (T,)
     variance: Array  # (T,)
     square: Array  # (T,) of the rewards before learning
-    count: Array  # (T,) of these rewards; ``_LEARNING`` once there are targets
+    count: Array  # (T,) of these rewards
+    learns: Array  # (T,) bool: there have been targets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +43,7 @@ class PopArt(NoScaling):
     rescaled.
     """
 
+    rescales: ClassVar[bool] = True
     target_rate: float = 3e-4
     """Weight of a new batch in the moving estimates of targets' mean and variance."""
 
@@ -51,16 +51,16 @@ class PopArt(NoScaling):
         parts.require_rates(self, "target_rate")
 
     def init(self, num_tasks: int) -> Estimates:
-        return Estimates(*Moments.begin(num_tasks), jnp.zeros(num_tasks), jnp.zeros(num_tasks))
+        return Estimates(*Moments.begin(num_tasks), *jnp.zeros((2, num_tasks)), jnp.zeros(num_tasks, bool))
 
     def observe(self, memory: Estimates, steps: Transition) -> Estimates:
         """Set the first units by the rewards before learning; after that, targets alone move them."""
-        learning, added = memory.count == _LEARNING, steps.reward.shape[1]
+        added = steps.reward.shape[1]
         count = memory.count + added
         drift = jnp.mean(jnp.square(steps.reward), axis=1) - memory.square
-        square = memory.square + drift * added / jnp.maximum(count, 1)
+        square = memory.square + drift * added / count
         new = memory._replace(square=square, count=count, variance=jnp.where(square > 0, square, memory.variance))
-        return jax.tree.map(partial(jnp.where, learning), memory, new)
+        return jax.tree.map(partial(jnp.where, memory.learns), memory, new)
 
     @staticmethod
     def std(memory: Estimates) -> Array:
@@ -75,7 +75,7 @@ class PopArt(NoScaling):
         drift = std * jnp.mean(target, axis=1)  # of the old mean, in reward
         moments = Moments(memory.mean, memory.variance)
         moments = moments.moved(self.target_rate, drift, jnp.square(std) * jnp.var(target, axis=1))
-        new = memory._replace(**moments._asdict(), count=jnp.full_like(memory.count, _LEARNING))
+        new = memory._replace(**moments._asdict(), learns=jnp.ones_like(memory.learns))
         factor = std / self.std(new)
         offset = (memory.mean - new.mean) / self.std(new)  # by as much as the mean moved, rounding included
         return new, tuple(rescale_heads(critic, factor, offset) for critic in critics)

@@ -1,7 +1,7 @@
 """Scalings by the discounted sum of an episode's rewards, backwards: G_t = r_t + gamma G_(t-1)."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 
@@ -40,6 +40,8 @@ class ReturnScaling(NoScaling):
     exceed the range, and is less than (1 + gamma) times as large. Before there is any reward the factor is 1.
     """
 
+    discounted: ClassVar[bool] = True
+    fits_returns: ClassVar[bool] = True
     return_range: float = 10.0
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
@@ -91,6 +93,7 @@ class ReturnNormalization(NoScaling):
     in the range.
     """
 
+    fits_returns: ClassVar[bool] = True
     return_range: float = 5.0
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
