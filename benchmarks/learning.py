@@ -47,9 +47,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from parts import Part, add_flags, is_part, require_all, run_parts, whole, write_result
-from report import markdown, note_origin, read_lines, record, run_main, write_lines
+from report import markdown, note_origin, read_lines, record, run_main, settings_of, texts_of, write_lines
 from resumable import train
-from returns import value
 
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
@@ -196,7 +195,6 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
     trial = FAMILIES.get(env, Trial())
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
-    training = {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.training)}
     return train(
         folder,
         program.family,
@@ -207,7 +205,7 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
         eval_every=-(-steps // arguments.evaluations),
         eval_episodes=arguments.eval_episodes,
         settings=program.training,
-        **training,
+        **settings_of(arguments.training),
         quiet=False,
     )
 
@@ -240,8 +238,8 @@ def settings_used(result: Result, folder: Path) -> dict[str, Any]:
 
 def family_settings(given: Sequence[str], vary: Sequence[str], split: str | None) -> dict[str, Any]:
     """Return the settings of a family from words such as pixels=64, from what it varies, and from its split."""
-    settings: dict[str, Any] = {"vary": dict(pair.split("=", 1) for pair in vary)} | ({"split": split} if split else {})
-    return settings | {name: value(x) for name, x in (pair.split("=", 1) for pair in given)}
+    settings: dict[str, Any] = {"vary": texts_of(vary)} | ({"split": split} if split else {})
+    return settings | settings_of(given)
 
 
 def seeing(agent: str, settings: dict) -> dict[str, Any]:

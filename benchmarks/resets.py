@@ -24,8 +24,7 @@ import numpy as np
 import parts
 import resumable
 from learning import cell
-from report import markdown, record, run_main
-from returns import value
+from report import markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
@@ -73,9 +72,8 @@ def part(arguments: argparse.Namespace, way: str) -> parts.Part:
 def measure(arguments: argparse.Namespace, way: str) -> None:
     """Learn in a way, or go on with the run that was stopped, and write the success of all evaluations."""
     enable_compile_cache()
-    read = lambda words: {name: value(x) for name, x in (word.split("=", 1) for word in words)}
-    plain = with_preset(arguments.env, arguments.agent, **read(arguments.env_settings))
-    agent, settings = configure(plain.learner, plain.training, {**read(arguments.training), **WAYS[way]})
+    plain = with_preset(arguments.env, arguments.agent, **settings_of(arguments.env_settings))
+    agent, settings = configure(plain.learner, plain.training, {**settings_of(arguments.training), **WAYS[way]})
     folder, steps = arguments.out / f"{way}.run", arguments.steps or plain.plan.steps
     result = resumable.train(
         folder,

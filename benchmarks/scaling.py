@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import parts
+from report import markdown, record, run_main, texts_of
 
 # Values on a CPU, and on a GPU.
 AXES = {
@@ -87,22 +88,18 @@ def part(axis: str, value: int, arguments: argparse.Namespace) -> parts.Part:
 def measure(arguments: argparse.Namespace, axis: str, value: int) -> None:
     """Time one setting beside its axis's base, and write its row. A machine with too few devices writes none."""
     import jax
-    from report import record, run_main
 
-    def run() -> None:
-        if axis == "devices" and value > jax.device_count():
-            print(f"there are {jax.device_count()} devices")
-            return
-        base = contestant(axis, BASE[axis], arguments)
-        own = base if value == BASE[axis] else contestant(axis, value, arguments)
-        for _ in range(arguments.repeats):
-            base.time()
-            if own is not base:
-                own.time()
-        result = record(arguments, {"rows": [row(axis, value, own, base)]})
-        parts.write_result(arguments.out / f"{axis}-{value}.json", result)
-
-    run_main(run)
+    if axis == "devices" and value > jax.device_count():
+        print(f"there are {jax.device_count()} devices")
+        return
+    base = contestant(axis, BASE[axis], arguments)
+    own = base if value == BASE[axis] else contestant(axis, value, arguments)
+    for _ in range(arguments.repeats):
+        base.time()
+        if own is not base:
+            own.time()
+    result = record(arguments, {"rows": [row(axis, value, own, base)]})
+    parts.write_result(arguments.out / f"{axis}-{value}.json", result)
 
 
 def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Any:
@@ -115,7 +112,7 @@ def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Any:
     num_tasks = {"tasks": value, "envs": _TASKS}.get(axis, 10)
     worlds = value if axis == "envs" else arguments.worlds
     seeds = {"seeds": value, "devices": _SEEDS}.get(axis, 1)
-    name, span = arguments.parameter.split("=", 1)
+    ((name, span),) = texts_of([arguments.parameter]).items()
     values = f"{span}:{num_tasks}" if num_tasks > 1 else f"{sum(map(float, span.split(':'))) / 2:g}"
     program = mtjax.preset(arguments.env, arguments.agent, vary={name: values}, split="none")
     experience: Any = program.learner.experience
@@ -173,8 +170,6 @@ def tabulate(arguments: argparse.Namespace) -> None:
 
 
 def table(rows: list[dict]) -> str:
-    from report import markdown
-
     head = ["worlds of a seed", "env-steps/s, all seeds", "range", "substeps/s", "updates/s", "cost", "compiled in"]
     cells = lambda row: [
         *(f"{row[name]:,}" for name in ("value", "worlds", "steps_per_second")),
@@ -205,4 +200,4 @@ def draw(path: Path, axis: str, rows: list[dict]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

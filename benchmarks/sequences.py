@@ -35,8 +35,7 @@ import parts
 import resumable
 from learning import cell
 from matplotlib.figure import Figure
-from report import markdown, record, run_main, write_lines
-from returns import value
+from report import markdown, record, run_main, settings_of, write_lines
 
 from mtjax.agents.parts.plasticity import PLASTICITY
 from mtjax.compiling.programs import enable_compile_cache
@@ -129,10 +128,9 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
     """Learn the tasks by a method, or go on with the run that was stopped, and write the scores of all evaluations."""
     enable_compile_cache()
     name, *words = method.split(":")
-    given = {key: value(x) for key, x in (word.split("=", 1) for word in [*arguments.training, *words])}
     chunk, played = protocol.each // protocol.evaluations, protocol.tasks * protocol.rounds
     kind = "plasticity" if name in PLASTICITY and name != "none" else "continual"
-    given = {**_COMMON, **protocol.settings, kind: name, **given}
+    given = {**_COMMON, **protocol.settings, kind: name, **settings_of([*arguments.training, *words])}
     given |= {"curriculum": f"{protocol.curriculum}:{protocol.each}", "chunk_steps": chunk}
     plain = with_preset(protocol.env, protocol.agent, **protocol.family)
     agent, settings = configure(plain.learner, plain.training, given)

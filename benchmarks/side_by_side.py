@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from report import markdown, publish
+from report import markdown, publish, run_main
 
 from mtjax.report.stats import paired_difference
 
@@ -163,4 +163,4 @@ def milliseconds(file: Path) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

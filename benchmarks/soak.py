@@ -19,7 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from report import machine, markdown
+from report import machine, markdown, run_main
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _RUN = (
@@ -80,4 +80,4 @@ def judge(samples: list[float]) -> tuple[list[float], bool]:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from report import markdown, publish
+from report import markdown, publish, run_main, texts_of
 
 _ON_CPU = jax.default_backend() == "cpu"
 # Tasks that are many have few environments and small batches each, so that the whole stays the same.
@@ -54,7 +54,7 @@ def main() -> None:
 
 def measure(agent: str, num_tasks: int, arguments: argparse.Namespace) -> list[dict]:
     """Run one setting with a cold and a warm cache."""
-    name, span = arguments.parameter.split("=", 1)
+    ((name, span),) = texts_of([arguments.parameter]).items()
     words = [f"--env={arguments.env}", f"--agent={agent}", f"--env.vary.{name}={span}:{num_tasks}"]
     words += [f"--seeds={arguments.seeds}", "--eval-every=1000000000", "--eval-episodes=1"]
     words += (MANY if num_tasks >= 100 else []) + arguments.flags
@@ -133,4 +133,4 @@ def table(rows: list[dict], mark: float) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

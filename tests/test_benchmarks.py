@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -555,7 +556,7 @@ def test_a_suites_agents_see_its_pictures(script, agent):
     """Agents whose subject is something else encode the pictures."""
     suite, learning = script("suite"), script("learning")
     pixels = suite.SUITES["pixels"]
-    settings = {name: script("returns").value(x) for name, x in (pair.split("=") for pair in pixels.settings)}
+    settings = script("report").settings_of(pixels.settings)
     program = mtjax.preset(pixels.envs[0], agent, "gpu", learning.seeing(agent, settings), **settings)
     require_sight(program.learner, program.family.spec)
     assert program.learner.representation.sees_pictures
@@ -733,6 +734,36 @@ def test_an_interrupted_benchmark_ends_without_a_traceback(script, capsys):
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:  # an interrupt let through would end pytest
         script("report").run_main(main)
     assert getattr(stop.value, "code", None) == 130 and capsys.readouterr().err == "interrupted\n"
+
+
+def test_wrong_input_ends_every_benchmark_with_one_line():
+    """All commands are run by what turns an error of input into a line."""
+    commands = {file.name: file.read_text() for file in FOLDER.glob("*.py") if "ArgumentParser(" in file.read_text()}
+    assert len(commands) > 25 and not [name for name, text in commands.items() if "    run_main(main)\n" not in text]
+
+
+def test_settings_are_words_with_an_equals_sign(script):
+    """What is behind it is read as JSON if it is some."""
+    settings_of, found = script("report").settings_of, {"hidden": (8, 8), "tau": 0.1, "engine": "c", "arguments": "a=b"}
+    assert settings_of(["hidden=[8,8]", "tau=0.1", "engine=c", "arguments=a=b"]) == found
+    with pytest.raises(InputError, match="'tau' is no setting; write NAME=VALUE"):
+        settings_of(["engine=c", "tau"])
+    with pytest.raises(InputError, match=r"--grid takes numbers: .*'x'"):
+        script("presets").grid(["tau=0.1,x"])
+
+
+@pytest.mark.parametrize("name", ["compare", "parts", "ppo_peer", "rejax_peer", "scaling"])
+def test_benchmarks_whose_parts_hold_the_device_import_no_jax(name):
+    code = f"import sys; sys.path.insert(0, {str(FOLDER)!r}); import {name}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_brax_sac_says_what_it_lacks_before_it_measures(script, monkeypatch):
+    brax_sac = script("brax_sac")
+    monkeypatch.setattr(sys, "argv", ["brax_sac.py"])
+    monkeypatch.setattr(brax_sac.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="pip install playground"):
+        brax_sac.main()
 
 
 @pytest.mark.parametrize("seconds", [3.6, 41.0, 63.0])
