@@ -339,6 +339,36 @@ def test_time_that_two_operations_share_counts_once(script):
     assert kernels.busy_seconds(operations) == 4
 
 
+def test_operations_are_what_computes(script):
+    """On a CPU a loop is recorded too, and covers what it holds."""
+    names = ["while", "while.3", "call_2", "conditional.1", "dot_1", "while_fusion", "custom-call.2"]
+    events = [
+        SimpleNamespace(name=name, stats=[("hlo_op", name)], start_ns=i, duration_ns=1e9)
+        for i, name in enumerate(names)
+    ]
+    thread = SimpleNamespace(name="tf_XLAEigen", events=[*events, SimpleNamespace(name="other", stats=[])])
+    data = SimpleNamespace(planes=[SimpleNamespace(name="/host:CPU", lines=[thread])])
+    assert [x.name for x in script("kernels").read(data)] == ["dot_1", "while_fusion", "custom-call.2"]
+
+
+def test_products_are_counted_with_their_loops(script):
+    """Two operations for each of 3 x 4 x 4 numbers, five times; and those of an update as it is timed."""
+    cost, trace = script("update_cost"), script("update_trace")
+    scan = lambda x, w: jax.lax.scan(lambda x, _: (x @ w, None), x, length=5)[0]
+    assert trace.matrix_flops(jax.make_jaxpr(scan)(np.ones((3, 4)), np.ones((4, 4)))) == 5 * 2 * 3 * 4 * 4
+    agent, tasks, keys = mtjax.agent("sac", hidden=(8,)), cost.tasks_of(2), jax.random.split(jax.random.key(0), 1)
+    state = jax.eval_shape(jax.vmap(lambda key: agent.init(cost.SPEC, tasks, key)), keys)
+    update = cost.updates(agent, tasks, cost.random_window(cost.SPEC, 2, 4), 3)
+    found = trace.matrix_flops(jax.make_jaxpr(update)(state, keys))
+    assert found > 0 and found % 3 == 0
+
+
+def test_ratios_are_named_after_the_agent_that_they_are_to(script):
+    row = {"agent": "drq", "tasks": 2, "seeds": 1, "milliseconds": 1.0, "fastest": 1.0, "slowest": 1.0}
+    row |= {"over_sac": 1.0, "parameters": 3, "compile_seconds": 1.0}
+    assert "| over drq |" in script("update_cost").table([row])
+
+
 @pytest.mark.parametrize(
     "samples, flat",
     [
@@ -778,3 +808,22 @@ def test_updates_are_timed_as_the_loop_makes_them(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["update_cost.py", *flags])
     script("update_cost").main()
     assert [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[2:4]] == ["| sac", "| care"]
+
+
+@pytest.mark.slow
+def test_kernels_of_an_update_are_listed(script, monkeypatch, capsys):
+    flags = ["--agents", "sac", "--tasks", "2", "--batch", "4", "--hidden", "8"]
+    monkeypatch.setattr(sys, "argv", ["kernels.py", *flags])
+    script("kernels").main()
+    told = capsys.readouterr().out
+    assert "| dot |" in told and "| while |" not in told and "\n| sac | 1 |" in told
+
+
+@pytest.mark.slow
+def test_updates_are_timed_with_their_numbers_as_data(script, monkeypatch, capsys):
+    numbers = script("traced_numbers")
+    for name, small in {"TASKS": 2, "BATCH": 4, "UPDATES": 2, "ROUNDS": 1}.items():
+        monkeypatch.setattr(numbers, name, small)
+    monkeypatch.setattr(sys, "argv", ["traced_numbers.py", "--agents", "sac"])
+    numbers.main()
+    assert capsys.readouterr().out.splitlines()[2].startswith("| sac | ")
