@@ -145,10 +145,11 @@ def test_figures_have_their_origin(module, tmp_path, monkeypatch):
 def test_scaling_has_a_row_for_every_result_and_begins_parts_with_their_settings(module, tmp_path, monkeypatch):
     """Each names its folder, also where that is named after the clock, and the device whose values it takes."""
     scaling, parts = module("scaling"), module("parts")
-    arguments = argparse.Namespace(axes=["seeds"], on="cpu", out=tmp_path, plots=tmp_path / "plots", json=None)
+    axes = ["seeds", "devices"]
+    arguments = argparse.Namespace(axes=axes, on="cpu", out=tmp_path, plots=tmp_path / "plots", json=None)
     monkeypatch.setattr(sys, "argv", ["scaling.py", "--axes", "seeds"])
-    of_all = [scaling.part(*each, arguments) for each in scaling.settings(arguments)]
-    assert [x.name for x in of_all] == ["seeds-1", "seeds-2", "seeds-4"]
+    of_all = [scaling.part(*each, arguments) for each in scaling.settings(arguments, 2)]
+    assert [x.name for x in of_all] == ["seeds-1", "seeds-2", "seeds-4", "devices-1", "devices-2"]  # there are no four
     assert of_all[1].words[2:] == ["--on", "cpu", "--out", str(tmp_path), "--part", "seeds", "2"]
     line = {"axis": "seeds", "worlds": 8, "steps_per_second": 1000, "substeps_per_second": 2000, "slowest": 1}
     line |= {"fastest": 2, "updates_per_second": 3.0, "compile_seconds": 4.0}
