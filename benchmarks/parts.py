@@ -114,8 +114,15 @@ class _Runner:
             self.running.add(process)
             _wait(process, end)
             self.running.discard(process)
-        state = "done" if result_of(self.out, part).exists() else f"no result, see {log}"
-        print(f"{part.name}: {state} after {time.time() - before:.0f} s", flush=True)
+        done = result_of(self.out, part).exists()
+        state = f"{'done' if done else 'no result'} after {time.time() - before:.0f} s"
+        print(f"{part.name}: {state}" + ("" if done else f", see {log}{_end_of(log)}"), flush=True)
+
+
+def _end_of(log: Path) -> str:
+    """Return the last line of a log, which says how the process ended; empty if there is none."""
+    lines = log.read_text(errors="replace").split("\n")
+    return next((f": {line}" for line in reversed(lines) if line.strip()), "")
 
 
 def _wait(process: subprocess.Popen, end: float) -> None:
@@ -132,7 +139,7 @@ def _wait(process: subprocess.Popen, end: float) -> None:
 def require_all(left: list[str]) -> None:
     """End the program if some parts have no result."""
     if left:
-        raise SystemExit(f"{len(left)} parts are left, which the same command runs: {' '.join(left)}")
+        raise SystemExit(f"left: {' '.join(left)}; the same command goes on with them")
 
 
 def is_part() -> bool:
