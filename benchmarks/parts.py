@@ -107,19 +107,19 @@ class _Runner:
         log.parent.mkdir(parents=True, exist_ok=True)
         chosen = {"CUDA_VISIBLE_DEVICES": device} if device else {}
         environment = {**os.environ, **chosen, **part.environment, STARTED: str(before)}
-        end = min(self.end, time.monotonic() + self.seconds + _GRACE)
         with log.open("w") as file:
             words = [sys.executable, self.script, *part.words]
             process = subprocess.Popen(words, env=environment, stdout=file, stderr=file)
             self.running.add(process)
-            _wait(process, end)
+            # Only now, so that a part that begins while all are asked to stop is asked too.
+            _wait(process, min(self.end, time.monotonic() + self.seconds + _GRACE))
             self.running.discard(process)
         done = result_of(self.out, part).exists()
         state = f"{'done' if done else 'no result'} after {time.time() - before:.0f} s"
-        print(f"{part.name}: {state}" + ("" if done else f", see {log}{_end_of(log)}"), flush=True)
+        print(f"{part.name}: {state}" + ("" if done else f", see {log}{end_of(log)}"), flush=True)
 
 
-def _end_of(log: Path) -> str:
+def end_of(log: Path) -> str:
     """Return the last line of a log, which says how the process ended; empty if there is none."""
     lines = log.read_text(errors="replace").split("\n")
     return next((f": {line}" for line in reversed(lines) if line.strip()), "")

@@ -82,6 +82,16 @@ def test_parts_stop_with_the_program_that_started_them(module, tmp_path):
     assert process.wait(20) == 128 + signal.SIGTERM and not (tmp_path / "a.log").exists()
 
 
+def test_a_part_that_begins_as_all_are_stopped_is_stopped(module, tmp_path, monkeypatch):
+    """The stop came when its process was not yet among those that run."""
+    parts, script, begin = module("parts"), tmp_path / "script.py", subprocess.Popen
+    script.write_text(_SCRIPT.format(folder=str(FOLDER)))
+    runner = parts._Runner(str(script), tmp_path, float("inf"), float("inf"))
+    monkeypatch.setattr(parts.subprocess, "Popen", lambda *words, **given: (runner.stop(), begin(*words, **given))[1])
+    runner.play(parts.Part("lasts", ["lasts", str(tmp_path)]), "0")
+    assert not (tmp_path / "lasts.json").exists()
+
+
 def peer_result(side, seed, times, returns, cold, compiling=30.0):
     """Times of training at which a side has returns, each after another million of steps."""
     curve = [
@@ -171,6 +181,25 @@ def test_playground_has_a_second_row_where_its_substeps_differ(module):
     default, ours = steps.playground_physics("FingerSpin", own)
     assert default[2].substeps == 4 and ours[2] == own and ours[1] == {"sim_dt": 0.01}
     assert len(steps.playground_physics("CheetahRun", steps.Physics(1, 0.01, "euler"))) == 1
+
+
+def test_a_run_without_metrics_tells_why_it_ended(module, tmp_path):
+    given = argparse.Namespace(patience=60.0, seeds=1, mark=900.0)
+    with pytest.raises(SystemExit, match=r"no metrics came from mtjax.train --agent=foo: .*unknown agent 'foo'"):
+        module("time_to_return").watch(["--agent=foo"], tmp_path, "cold", given)
+
+
+def test_solver_iterations_are_those_of_a_mujoco_model(module):
+    with pytest.raises(mtjax.InputError, match="'link' is no family of one MuJoCo model"):
+        next(module("solver_iterations").measure("link", ("c",), argparse.Namespace()))
+
+
+def test_a_file_without_curves_is_told(module, tmp_path):
+    published, (none, other) = module("published"), (tmp_path / "none.csv", tmp_path / "other.csv")
+    other.write_text("family,steps\nfish-swim,3\n")
+    for file in (none, other):
+        with pytest.raises(mtjax.InputError, match=rf"{file.name}' is no file with lines of family, seconds, return"):
+            published.read(file)
 
 
 def test_a_family_is_learned_by_its_share_of_what_is_published(module):
