@@ -331,7 +331,7 @@ def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> li
     """Return the cells of one run's line: last evaluation by split, times, rate."""
     scores = last_scores(evaluations)
     cells = [env, agent]
-    cells += [cell(seed_interval(scores[split], iqm)) if split in scores else "-" for split in SPLITS]
+    cells += [f"{seed_interval(scores[split], iqm):.0f}" if split in scores else "-" for split in SPLITS]
     cells.append(f"{scores['train'].mean(axis=0).min():.0f}")
     steps, seconds, wall, returns = np.moveaxis(curve[:, :, 1:], -1, 0).mean(axis=-1)
     reached = np.flatnonzero(returns >= mark)
@@ -382,9 +382,9 @@ def difference_rows(differences: Sequence[Difference]) -> list[list[str]]:
     adjusted = holm(np.array([x.p for x in differences]))
     lines = []
     for x, p in zip(differences, adjusted, strict=True):
-        paired = cell(x.paired, "+.1f") if x.paired else "-"
+        paired = f"{x.paired:+.1f}" if x.paired else "-"
         tested = ["-", "-"] if np.isnan(p) else [f"{p:.4f}", "yes" if p < 0.05 else "no"]
-        lines.append([x.env, x.agent, x.split, paired, *tested, cell(x.unpaired, "+.1f"), cell(x.improvement, ".2f")])
+        lines.append([x.env, x.agent, x.split, paired, *tested, f"{x.unpaired:+.1f}", f"{x.improvement:.2f}"])
     return lines
 
 
@@ -407,12 +407,6 @@ def by_episode(scores: np.ndarray, trial: int) -> np.ndarray:
     """Return the last of scores (S, V, T, episodes) by the episode of the trial (S, T, trial), means over trials."""
     require_whole(scores.shape[-1], trial)
     return scores[:, -1].reshape(len(scores), scores.shape[2], -1, trial).mean(axis=2)
-
-
-def cell(interval: Interval, form: str = ".0f") -> str:
-    """Return an estimate with its interval, if it has one."""
-    point, low, high = (format(x, form) for x in interval)
-    return f"{point} [{low}, {high}]" if np.isfinite(interval.low) else point
 
 
 def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import parts
 import resumable
-from learning import cell
 from report import markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
@@ -116,8 +115,8 @@ def row(found: dict[str, Any], way: str) -> list[str]:
     means = [success.mean(axis=1), success[:, -1]]  # type: ignore
     against = "-"
     if naive is not None and way != "naive" and naive.shape == success.shape:  # type: ignore
-        against = cell(stats.paired_difference(means[0], naive.mean(axis=1)), ".2f")
-    return [f"`{way}`", *(cell(stats.seed_interval(x), ".2f") for x in means), against, str(found[way]["wall_seconds"])]
+        against = f"{stats.paired_difference(means[0], naive.mean(axis=1)):.2f}"
+    return [f"`{way}`", *(f"{stats.seed_interval(x):.2f}" for x in means), against, f"{found[way]['wall_seconds']}"]
 
 
 if __name__ == "__main__":

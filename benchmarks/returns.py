@@ -33,7 +33,7 @@ from mtjax.config import configure, with_preset
 from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import Episodes, evaluate, save_evaluations
 from mtjax.names import replacing
-from mtjax.report.stats import seed_interval
+from mtjax.report.stats import Interval, seed_interval
 from mtjax.saved.result import Result
 from mtjax.types import SPLITS, Agent
 
@@ -180,7 +180,7 @@ def tabulate(out: Path) -> None:
             f"{x['steps']:,}",
             f"{x['seconds']:.0f}",
             f"{x['steps_per_second']:,}",
-            f"{x['train']:.0f} [{x['low']:.0f}, {x['high']:.0f}]",
+            f"{Interval(x['train'], x['low'], x['high']):.0f}",
             *(show(x[split]) for split in SPLITS[1:]),
             show(x["limited"]),
             show(x["worst_task"]),

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import parts
-from learning import cell
 from report import markdown, record, run_main, settings_of
 
 import mtjax
@@ -92,7 +91,7 @@ def table(found: dict[str, Any]) -> str:
         scores = np.array(found[way]["returns"])
         parts = scores[:, 0], scores[:, -1], scores.mean(axis=1)
         gained = stats.paired_difference(scores.mean(axis=1), plain.mean(axis=1))
-        rows.append([way, *(cell(stats.seed_interval(x), ".2f") for x in parts), cell(gained, "+.2f")])
+        rows.append([way, *(f"{stats.seed_interval(x):.2f}" for x in parts), f"{gained:+.2f}"])
     return markdown(["way", "before", "at the end", "on average", "on average, less scratch"], rows)
 
 

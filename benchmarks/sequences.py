@@ -33,7 +33,6 @@ import jax.numpy as jnp
 import numpy as np
 import parts
 import resumable
-from learning import cell
 from matplotlib.figure import Figure
 from report import markdown, record, run_main, settings_of, write_lines
 
@@ -200,11 +199,11 @@ def row(method: str, found: dict[str, Measures]) -> list[str]:
     alone, plain = (None if method == name else found.get(name) for name in ("scratch", "none"))
     if alone is not None:
         gained = sequences.forward_transfer(own.areas, alone.areas.mean(axis=0))
-        transfer = cell(stats.seed_interval(np.nanmean(gained, axis=1)), ".2f")
+        transfer = f"{stats.seed_interval(np.nanmean(gained, axis=1)):.2f}"
     if plain is not None and len(plain.performance) == len(own.performance):
-        against = cell(stats.paired_difference(own.performance, plain.performance), ".2f")
+        against = f"{stats.paired_difference(own.performance, plain.performance):.2f}"
     shown = (own.performance, own.forgetting, own.areas.mean(axis=1))
-    return [method, *(cell(stats.seed_interval(x), ".2f") for x in shown), transfer, against]
+    return [method, *(f"{stats.seed_interval(x):.2f}" for x in shown), transfer, against]
 
 
 def curves(result: dict[str, Any]) -> list[dict[str, Any]]:
