@@ -66,7 +66,9 @@ def soak(seconds: float, flags: list[str]) -> tuple[list[float], int]:
             seen |= {str(path) for path in Path(runs).glob("*/checkpoints/*") if path.name.isdigit()}
             time.sleep(1 / _RATE)
         process.send_signal(signal.SIGTERM)
-        if process.wait(300) != 128 + signal.SIGTERM:
+        if process.wait(300) == -signal.SIGTERM:  # which it did not yet handle
+            sys.exit("the run was still compiling when the time was over; give more --minutes")
+        if process.returncode != 128 + signal.SIGTERM:
             sys.exit(f"the run ended by itself with code {process.returncode}")
     return samples, len(seen)
 
