@@ -122,7 +122,7 @@ def tabulate(out: Path) -> str:
 def line(env: str, rung: str, split: str, returns: np.ndarray) -> list[str]:
     """Return the cells of a rung's returns (S, T, episodes of a trial) on a split."""
     form = ".3g" if np.abs(returns).max() < 100 else ".0f"
-    cells = [learning.cell(seed_interval(x), form) for x in (returns[..., 0], returns[..., -1], returns.mean(axis=-1))]
+    cells = [format(seed_interval(x), form) for x in (returns[..., 0], returns[..., -1], returns.mean(axis=-1))]
     return [env, rung, str(len(returns)), split, str(returns.shape[1]), *cells]
 
 

@@ -12,11 +12,12 @@ compiling, warming up and evaluating are left out. Ours is timed before and afte
 import argparse
 import dataclasses
 import functools
+import importlib.util
 import statistics
 
 import jax
 import jax.numpy as jnp
-from report import publish
+from report import publish, run_main
 from training import Training
 
 import mtjax
@@ -31,6 +32,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="times that many steps")
     parser.add_argument("--json", help="write the figures to this file too")
     arguments = parser.parse_args()
+    if importlib.util.find_spec("mujoco_playground") is None:
+        raise InputError("Playground is not installed: pip install playground==0.2.0")
     program = mtjax.preset("finger-spin-vary-size", arguments.agent)
     settings = dataclasses.replace(program.training, warmup_steps=1, chunk_steps=arguments.steps)
     ours = Training(program.family, program.learner, settings)
@@ -98,7 +101,4 @@ def row(name: str, worlds: int, rates: list[float]) -> dict:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (InputError, ImportError) as error:
-        raise SystemExit(f"error: {error}") from None
+    run_main(main)

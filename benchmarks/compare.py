@@ -19,6 +19,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from report import run_main
+
 # Figures of which less is better, and those of which more is. Other entries of a row are its settings or spreads.
 LESS = ("milliseconds", "compile_seconds", "first_call_seconds", "first_metrics", "training", "reached", "cost")
 MORE = ("steps_per_second", "updates_per_second")
@@ -114,4 +116,4 @@ def _words(which: tuple) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

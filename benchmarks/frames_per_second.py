@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from report import publish
+from report import publish, run_main
 
 import mtjax
 from mtjax.envs.pixels import Pictured
@@ -130,4 +130,4 @@ def table(rows: list[dict[str, Any]], domain: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import parts
-from learning import cell
 from report import markdown, record, run_main
 
 from mtjax.command import search as command
@@ -105,7 +104,7 @@ def table(out: Path, rungs: int) -> str:
     found = [compared(whole[i], halved[i]) for i in sorted(whole.keys() & halved.keys())]
     titles = ["search", "best of all", "found by halving", "its rank", "share of steps", "seconds, all", "halving"]
     rows = [[str(i), *(f"{x:.4g}" for x in line)] for i, line in enumerate(found)]
-    means = [cell(stats.seed_interval(np.array(column)), ".4g") for column in zip(*found, strict=True)]
+    means = [f"{stats.seed_interval(np.array(column)):.4g}" for column in zip(*found, strict=True)]
     text = markdown(titles, rows + ([["mean", *means]] if found else []))
     (out / "table.md").write_text(text + "\n")
     return text

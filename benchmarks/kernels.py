@@ -3,12 +3,12 @@
     python benchmarks/kernels.py [--agents sac care ...] [--tasks 10] [--seeds 1] [--batch 128] [--hidden 400 400 400]
                                  [--top 12] [--json FILE]
 
-Updates are those of ``update_cost.py``. JAX's profiler records one call of them. On a GPU an operation is a kernel. The
-time that no kernel covers is idle: launches, and waiting for the one before. Operations count as products by their
-names. "GFLOP" is XLA's own count for one update, elementwise operations included. The rate that it is compared with is
-that of a product of two matrices of 8192 x 8192 (1024 on a CPU) in the same process and precision. Kernels inside CUDA
-graphs are listed one by one only if XLA makes no graphs: ``XLA_FLAGS=--xla_gpu_enable_command_buffer=``; updates are
-then slower than usual.
+Updates are those of ``update_cost.py``. JAX's profiler records one call of them. On a GPU an operation is a kernel. On
+a CPU loops and calls are left out, as other operations are inside them. The time that no operation covers is idle:
+launches, and waiting for the one before. Operations count as products by their names. "GFLOP" is XLA's own count for
+one update, elementwise operations included. The rate that it is compared with is that of a product of two matrices of
+8192 x 8192 (1024 on a CPU) in the same process and precision. Kernels inside CUDA graphs are listed one by one only if
+XLA makes no graphs: ``XLA_FLAGS=--xla_gpu_enable_command_buffer=``; updates are then slower than usual.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from update_cost import SPEC, Contestant, random_window, tasks_of
 import mtjax
 
 _ON_CPU = jax.default_backend() == "cpu"
+_HOLDS_OTHERS = re.compile(r"(while|call|conditional)([._]\d+)*")  # operations of a CPU's program
 _PRODUCT = re.compile(r"gemm|nvjet|cutlass|cublas|(^|_)dot|matmul|custom-call", re.IGNORECASE)
 
 
@@ -90,7 +91,8 @@ def read(data: Any) -> list[Operation]:
         if "stream" in line.name.lower() or "XLA" in line.name:
             for event in line.events:
                 stats = dict(event.stats)
-                if "hlo_op" in stats or "Stream" in line.name:
+                own = "hlo_op" in stats and not _HOLDS_OTHERS.fullmatch(event.name)
+                if own or "Stream" in line.name:
                     found.append(Operation(event.name, event.start_ns / 1e9, event.duration_ns / 1e9))
     return sorted(found, key=lambda x: x.start)
 

@@ -47,9 +47,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from parts import Part, add_flags, is_part, require_all, run_parts, whole, write_result
-from report import markdown, note_origin, read_lines, record, run_main, write_lines
+from report import markdown, note_origin, read_lines, record, run_main, settings_of, texts_of, write_lines
 from resumable import train
-from returns import value
 
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
@@ -196,7 +195,6 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
     trial = FAMILIES.get(env, Trial())
     given = trial.replay_steps if isinstance(program.learner.experience, Replay) else trial.rollout_steps
     steps = arguments.steps or given or program.plan.steps
-    training = {name: value(x) for name, x in (pair.split("=", 1) for pair in arguments.training)}
     return train(
         folder,
         program.family,
@@ -207,7 +205,7 @@ def trained(arguments: argparse.Namespace, env: str, agent: str, folder: Path) -
         eval_every=-(-steps // arguments.evaluations),
         eval_episodes=arguments.eval_episodes,
         settings=program.training,
-        **training,
+        **settings_of(arguments.training),
         quiet=False,
     )
 
@@ -240,8 +238,8 @@ def settings_used(result: Result, folder: Path) -> dict[str, Any]:
 
 def family_settings(given: Sequence[str], vary: Sequence[str], split: str | None) -> dict[str, Any]:
     """Return the settings of a family from words such as pixels=64, from what it varies, and from its split."""
-    settings: dict[str, Any] = {"vary": dict(pair.split("=", 1) for pair in vary)} | ({"split": split} if split else {})
-    return settings | {name: value(x) for name, x in (pair.split("=", 1) for pair in given)}
+    settings: dict[str, Any] = {"vary": texts_of(vary)} | ({"split": split} if split else {})
+    return settings | settings_of(given)
 
 
 def seeing(agent: str, settings: dict) -> dict[str, Any]:
@@ -333,7 +331,7 @@ def row(env: str, agent: str, curve: np.ndarray, evaluations, mark: float) -> li
     """Return the cells of one run's line: last evaluation by split, times, rate."""
     scores = last_scores(evaluations)
     cells = [env, agent]
-    cells += [cell(seed_interval(scores[split], iqm)) if split in scores else "-" for split in SPLITS]
+    cells += [f"{seed_interval(scores[split], iqm):.0f}" if split in scores else "-" for split in SPLITS]
     cells.append(f"{scores['train'].mean(axis=0).min():.0f}")
     steps, seconds, wall, returns = np.moveaxis(curve[:, :, 1:], -1, 0).mean(axis=-1)
     reached = np.flatnonzero(returns >= mark)
@@ -384,9 +382,9 @@ def difference_rows(differences: Sequence[Difference]) -> list[list[str]]:
     adjusted = holm(np.array([x.p for x in differences]))
     lines = []
     for x, p in zip(differences, adjusted, strict=True):
-        paired = cell(x.paired, "+.1f") if x.paired else "-"
+        paired = f"{x.paired:+.1f}" if x.paired else "-"
         tested = ["-", "-"] if np.isnan(p) else [f"{p:.4f}", "yes" if p < 0.05 else "no"]
-        lines.append([x.env, x.agent, x.split, paired, *tested, cell(x.unpaired, "+.1f"), cell(x.improvement, ".2f")])
+        lines.append([x.env, x.agent, x.split, paired, *tested, f"{x.unpaired:+.1f}", f"{x.improvement:.2f}"])
     return lines
 
 
@@ -409,12 +407,6 @@ def by_episode(scores: np.ndarray, trial: int) -> np.ndarray:
     """Return the last of scores (S, V, T, episodes) by the episode of the trial (S, T, trial), means over trials."""
     require_whole(scores.shape[-1], trial)
     return scores[:, -1].reshape(len(scores), scores.shape[2], -1, trial).mean(axis=2)
-
-
-def cell(interval: Interval, form: str = ".0f") -> str:
-    """Return an estimate with its interval, if it has one."""
-    point, low, high = (format(x, form) for x in interval)
-    return f"{point} [{low}, {high}]" if np.isfinite(interval.low) else point
 
 
 def evaluation_rows(env: str, agent: str, evaluations) -> list[dict]:

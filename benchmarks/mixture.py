@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from parts import whole
-from report import markdown, record
+from report import markdown, record, run_main, settings_of
 
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10, help="of each task in an evaluation")
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--preset", default="auto")
-    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=N", help="such as replay_size=100000")
+    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="such as replay_size=100000")
     parser.add_argument("--timed-steps", type=int, default=100, help="steps in a timed call; 0 leaves the cost out")
     parser.add_argument("--minutes", type=float, default=8.0, help="after which no further part begins")
     parser.add_argument("--out", type=Path, default=Path("runs") / "mixture")
@@ -103,7 +103,6 @@ def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str,
     """Train one agent. A task alone uses the preset of the mixture, not its own tuned preset."""
     config = mtjax.preset("+".join(arguments.tasks), agent, arguments.preset)
     family = mtjax.make(env_name, **engine(arguments, env_name))
-    given: dict[str, Any] = {name: int(value) for name, value in (pair.split("=", 1) for pair in arguments.training)}
     steps = arguments.steps * family.train_count
     result = mtjax.train(
         family,
@@ -116,7 +115,7 @@ def learn(arguments: argparse.Namespace, env_name: str, agent: str) -> dict[str,
         num_envs=arguments.num_envs,
         updates_per_step=arguments.updates_per_step,
         quiet=False,
-        **given,
+        **settings_of(arguments.training),
     )
     returns = result.evaluations.returns["train"].mean(axis=-1)  # (S, V, T)
     names = family.labels("train") if "+" in env_name else [env_name]
@@ -241,4 +240,4 @@ def summarise(arguments: argparse.Namespace) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

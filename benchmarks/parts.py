@@ -107,15 +107,22 @@ class _Runner:
         log.parent.mkdir(parents=True, exist_ok=True)
         chosen = {"CUDA_VISIBLE_DEVICES": device} if device else {}
         environment = {**os.environ, **chosen, **part.environment, STARTED: str(before)}
-        end = min(self.end, time.monotonic() + self.seconds + _GRACE)
         with log.open("w") as file:
             words = [sys.executable, self.script, *part.words]
             process = subprocess.Popen(words, env=environment, stdout=file, stderr=file)
             self.running.add(process)
-            _wait(process, end)
+            # Only now, so that a part that begins while all are asked to stop is asked too.
+            _wait(process, min(self.end, time.monotonic() + self.seconds + _GRACE))
             self.running.discard(process)
-        state = "done" if result_of(self.out, part).exists() else f"no result, see {log}"
-        print(f"{part.name}: {state} after {time.time() - before:.0f} s", flush=True)
+        done = result_of(self.out, part).exists()
+        state = f"{'done' if done else 'no result'} after {time.time() - before:.0f} s"
+        print(f"{part.name}: {state}" + ("" if done else f", see {log}{end_of(log)}"), flush=True)
+
+
+def end_of(log: Path) -> str:
+    """Return the last line of a log, which says how the process ended; empty if there is none."""
+    lines = log.read_text(errors="replace").split("\n")
+    return next((f": {line}" for line in reversed(lines) if line.strip()), "")
 
 
 def _wait(process: subprocess.Popen, end: float) -> None:
@@ -132,7 +139,7 @@ def _wait(process: subprocess.Popen, end: float) -> None:
 def require_all(left: list[str]) -> None:
     """End the program if some parts have no result."""
     if left:
-        raise SystemExit(f"{len(left)} parts are left, which the same command runs: {' '.join(left)}")
+        raise SystemExit(f"left: {' '.join(left)}; the same command goes on with them")
 
 
 def is_part() -> bool:

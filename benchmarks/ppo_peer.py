@@ -39,6 +39,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import parts
+from report import markdown, record, run_main
 
 # Playground's task and ours.
 ENVS = {
@@ -106,8 +107,6 @@ def play(arguments: argparse.Namespace, env: str, side: str, seed: int) -> None:
     learn = theirs if side.startswith("playground") else ours
     cold = not any(Path(os.environ[_CACHE]).glob("*"))
     curve, choices = learn(arguments, env, side, seed)
-    from report import record  # only now, as Playground's side needs neither
-
     result = {"env": env, "side": side, "seed": seed, "cold": cold, "choices": choices}
     result |= {"seconds": parts.since_start(), "curve": [point._asdict() for point in curve]}
     parts.write_result(arguments.out / env / f"{side}-{seed}.json", record(arguments, result))
@@ -257,8 +256,6 @@ def show(side: str, point: Reached) -> None:
 
 def tabulate(out: Path, marks: list[float]) -> str:
     """Write the tables of all results, and return that of times."""
-    from report import markdown
-
     found: dict[tuple[str, str], list[dict]] = {}
     for result in parts.read_results(out):
         found.setdefault((result["env"], result["side"]), []).append(result)
@@ -325,4 +322,4 @@ def steps_per_second(curve: list[dict]) -> float | None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -24,13 +24,14 @@ from typing import Any
 
 import numpy as np
 from parts import whole
-from report import markdown, note_origin, read_lines, run_main, write_lines
+from report import markdown, note_origin, read_lines, run_main, settings_of, texts_of, write_lines
 from resumable import train
-from returns import FAMILIES, value
+from returns import FAMILIES
 
 from mtjax.agents.swept import Point
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
+from mtjax.names import InputError
 from mtjax.saved.result import Result
 
 _RATES = ("actor_lr", "critic_lr", "temperature_lr")
@@ -58,7 +59,11 @@ def main() -> None:
 
 def grid(words: list[str]) -> list[dict[str, float]]:
     """Return every combination of the values in words such as ``tau=0.01,0.02``."""
-    axes = {name: [float(x) for x in values.split(",")] for name, values in (word.split("=", 1) for word in words)}
+    texts = texts_of(words)
+    try:
+        axes = {name: [float(x) for x in values.split(",")] for name, values in texts.items()}
+    except ValueError as error:
+        raise InputError(f"--grid takes numbers: {error}") from None
     return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
 
@@ -74,8 +79,7 @@ def sweep(arguments: argparse.Namespace) -> None:
     varied: dict[str, Any] = {"vary": FAMILIES[family].vary} if family in FAMILIES and FAMILIES[family].vary else {}
     varied |= {"split": arguments.split} if arguments.split else {}
     config = with_preset(family, arguments.agent, arguments.preset, engine=arguments.engine, **varied)
-    given = {name: value(x) for name, x in (word.split("=", 1) for word in arguments.given)}
-    agent, settings = configure(config.learner, config.training, given)
+    agent, settings = configure(config.learner, config.training, settings_of(arguments.given))
     folder, steps = arguments.out / family / f"{arguments.agent}-{arguments.name}", arguments.steps or config.plan.steps
     last = [0.0]
 

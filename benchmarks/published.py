@@ -14,8 +14,11 @@ from typing import NamedTuple
 
 from report import markdown, read_lines, run_main
 
+from mtjax.names import InputError
+
 SHARE = 0.6
 _MOST = 1000.0  # of dm_control's episodes
+_COLUMNS = ("family", "seconds", "return")
 
 
 class Best(NamedTuple):
@@ -49,7 +52,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE.csv")
     for file in parser.parse_args().files:
-        print(tabulate(last_returns(read_lines(file))))
+        print(tabulate(last_returns(read(file))))
+
+
+def read(file: Path) -> list[dict[str, str]]:
+    """Return the lines of a file of curves.
+
+    Raises:
+        InputError: there is no such file, or it has other columns.
+    """
+    lines = read_lines(file) if file.is_file() else []
+    if not lines or not set(_COLUMNS) <= set(lines[0]):
+        raise InputError(f"{str(file)!r} is no file with lines of {', '.join(_COLUMNS)}")
+    return lines
 
 
 def nominal(family: str) -> str:

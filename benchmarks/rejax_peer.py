@@ -23,6 +23,7 @@ from typing import Any
 
 import parts
 from ppo_peer import gradient_steps
+from report import markdown, record, run_main
 
 SIDES = ("rejax", "mtjax-as-rejax", "mtjax")
 _EPISODES = 128  # of an evaluation, rejax's own number
@@ -57,8 +58,6 @@ def main() -> None:
 def play(arguments: argparse.Namespace, side: str, seeds: int) -> None:
     """Run one side with a number of seeds, and write its result."""
     found = theirs(arguments.steps, seeds) if side == "rejax" else ours(arguments.steps, seeds, side)
-    from report import record  # only now, as rejax's side needs it not
-
     figures = {"side": side, "seeds": seeds, "process_seconds": parts.since_start(), **found}
     parts.write_result(arguments.out / f"{side}-{seeds}.json", record(arguments, figures))
 
@@ -129,7 +128,6 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
 def tabulate(out: Path) -> str:
     """Write and return the table of all results, by the number of seeds."""
     import numpy as np
-    from report import markdown
 
     lines = []
     for x in sorted(parts.read_results(out), key=lambda x: (x["seeds"], SIDES.index(x["side"]))):
@@ -156,4 +154,4 @@ def tabulate(out: Path) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

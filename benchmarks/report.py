@@ -1,4 +1,7 @@
-"""Helpers of all benchmarks: the description of the machine, tables, lines of metrics and JSON reports."""
+"""Helpers of all benchmarks: settings, the description of the machine, tables, lines of metrics and JSON reports.
+
+This module imports no JAX until it describes the machine, as some benchmarks leave the device to other processes.
+"""
 
 import argparse
 import csv
@@ -13,8 +16,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import jax
 
 import mtjax
 from mtjax.names import InputError
@@ -36,11 +37,39 @@ def run_main(main: Callable[[], None]) -> None:
         raise SystemExit(130) from None
 
 
+def texts_of(words: Sequence[str]) -> dict[str, str]:
+    """Return the values of words such as ``tau=0.01`` by their names, as they are written.
+
+    Raises:
+        InputError: a word has no equals sign.
+    """
+    for word in words:
+        if "=" not in word:
+            raise InputError(f"{word!r} is no setting; write NAME=VALUE")
+    return dict(word.split("=", 1) for word in words)
+
+
+def settings_of(words: Sequence[str]) -> dict[str, Any]:
+    """Return the values of words such as ``hidden=[64,64]`` by their names, each read as JSON or else as a word."""
+    return {name: value(text) for name, text in texts_of(words).items()}
+
+
+def value(word: str) -> Any:
+    """Read a setting as JSON, or else as a word."""
+    try:
+        found = json.loads(word)
+    except json.JSONDecodeError:
+        return word
+    return tuple(found) if isinstance(found, list) else found
+
+
 def machine() -> dict[str, Any]:
     """Return the machine, the versions, the commit and the date of figures.
 
     ``MTJAX_COMMIT`` names the commit where a copy without its history runs. "+" marks changes beyond the commit.
     """
+    import jax
+
     devices = jax.devices()
     return {
         "device": devices[0].device_kind,

@@ -23,9 +23,7 @@ from typing import Any
 import numpy as np
 import parts
 import resumable
-from learning import cell
-from report import markdown, record, run_main
-from returns import value
+from report import markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
@@ -73,9 +71,8 @@ def part(arguments: argparse.Namespace, way: str) -> parts.Part:
 def measure(arguments: argparse.Namespace, way: str) -> None:
     """Learn in a way, or go on with the run that was stopped, and write the success of all evaluations."""
     enable_compile_cache()
-    read = lambda words: {name: value(x) for name, x in (word.split("=", 1) for word in words)}
-    plain = with_preset(arguments.env, arguments.agent, **read(arguments.env_settings))
-    agent, settings = configure(plain.learner, plain.training, {**read(arguments.training), **WAYS[way]})
+    plain = with_preset(arguments.env, arguments.agent, **settings_of(arguments.env_settings))
+    agent, settings = configure(plain.learner, plain.training, {**settings_of(arguments.training), **WAYS[way]})
     folder, steps = arguments.out / f"{way}.run", arguments.steps or plain.plan.steps
     result = resumable.train(
         folder,
@@ -118,8 +115,8 @@ def row(found: dict[str, Any], way: str) -> list[str]:
     means = [success.mean(axis=1), success[:, -1]]  # type: ignore
     against = "-"
     if naive is not None and way != "naive" and naive.shape == success.shape:  # type: ignore
-        against = cell(stats.paired_difference(means[0], naive.mean(axis=1)), ".2f")
-    return [f"`{way}`", *(cell(stats.seed_interval(x), ".2f") for x in means), against, str(found[way]["wall_seconds"])]
+        against = f"{stats.paired_difference(means[0], naive.mean(axis=1)):.2f}"
+    return [f"`{way}`", *(f"{stats.seed_interval(x):.2f}" for x in means), against, f"{found[way]['wall_seconds']}"]
 
 
 if __name__ == "__main__":

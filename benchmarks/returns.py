@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from parts import whole
-from report import markdown, record, run_main, write_lines
+from report import markdown, record, run_main, settings_of, write_lines
 from resumable import train
 
 from mtjax.agents.hyperparameters import replace
@@ -33,7 +33,7 @@ from mtjax.config import configure, with_preset
 from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import Episodes, evaluate, save_evaluations
 from mtjax.names import replacing
-from mtjax.report.stats import seed_interval
+from mtjax.report.stats import Interval, seed_interval
 from mtjax.saved.result import Result
 from mtjax.types import SPLITS, Agent
 
@@ -90,11 +90,10 @@ def main() -> None:
 
 def learn(arguments: argparse.Namespace, family: str) -> None:
     """Train on one family, and save the results."""
-    given = dict(word.split("=", 1) for word in arguments.given)
     aim = FAMILIES[family]
     varied = {"vary": aim.vary} if aim.vary else {}
     config = with_preset(family, arguments.agent or aim.agent, arguments.preset, engine=arguments.engine, **varied)
-    agent, settings = configure(config.learner, config.training, {name: value(x) for name, x in given.items()})
+    agent, settings = configure(config.learner, config.training, settings_of(arguments.given))
     steps = arguments.steps or aim.steps
     print(f"{family}: {steps:,} steps of {arguments.seeds} seeds\n{agent}\n{settings}", flush=True)
     file, last = arguments.out / f"{family}.csv", [0.0]
@@ -136,15 +135,6 @@ def limited(family: FamilyOrMixture, agent: Agent, result: Result, arguments: ar
     episodes = Episodes(arguments.eval_episodes)
     scores = evaluate(family, agent, episodes, result.state.agent, tasks, seeds, jnp.int32(0))
     return round(float(scores.returns.mean()), 1)
-
-
-def value(word: str) -> Any:
-    """Read a setting as JSON, or else as a word."""
-    try:
-        found = json.loads(word)
-    except json.JSONDecodeError:
-        return word
-    return tuple(found) if isinstance(found, list) else found
 
 
 def row(family: str, result: Result, seeds: int) -> dict[str, Any]:
@@ -190,7 +180,7 @@ def tabulate(out: Path) -> None:
             f"{x['steps']:,}",
             f"{x['seconds']:.0f}",
             f"{x['steps_per_second']:,}",
-            f"{x['train']:.0f} [{x['low']:.0f}, {x['high']:.0f}]",
+            f"{Interval(x['train'], x['low'], x['high']):.0f}",
             *(show(x[split]) for split in SPLITS[1:]),
             show(x["limited"]),
             show(x["worst_task"]),

@@ -22,9 +22,7 @@ from typing import Any
 
 import numpy as np
 import parts
-from learning import cell
-from report import markdown, record, run_main
-from returns import value
+from report import markdown, record, run_main, settings_of
 
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
@@ -55,8 +53,7 @@ def main() -> None:
     parser.add_argument("given", nargs="*", metavar="NAME=VALUE")
     arguments = parser.parse_args()
     enable_compile_cache()
-    given = _COMMON | {"seeds": arguments.seeds, "quiet": True}
-    given |= {name: value(x) for name, x in (word.split("=", 1) for word in arguments.given)}
+    given = _COMMON | {"seeds": arguments.seeds, "quiet": True} | settings_of(arguments.given)
     found: dict[str, Any] = {}
     for agent in ("options", "ppo"):
         settings = given | (_OF_OPTIONS if agent == "options" else {})
@@ -88,13 +85,13 @@ def write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
 
 
 def table(found: dict[str, Any]) -> str:
-    """Return the return of each way, with intervals over seeds, and what it gains at the end over ``scratch``."""
+    """Return the returns of each way, with intervals over seeds, and what it gains on average over ``scratch``."""
     plain, rows = np.array(found["scratch"]["returns"]), []
     for way in WAYS:
         scores = np.array(found[way]["returns"])
         parts = scores[:, 0], scores[:, -1], scores.mean(axis=1)
         gained = stats.paired_difference(scores.mean(axis=1), plain.mean(axis=1))
-        rows.append([way, *(cell(stats.seed_interval(x), ".2f") for x in parts), cell(gained, "+.2f")])
+        rows.append([way, *(f"{stats.seed_interval(x):.2f}" for x in parts), f"{gained:+.2f}"])
     return markdown(["way", "before", "at the end", "on average", "on average, less scratch"], rows)
 
 

@@ -31,9 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import parts
 import resumable
-from learning import cell
-from report import markdown, record, run_main
-from returns import value
+from report import markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
@@ -123,7 +121,7 @@ def measure(arguments: argparse.Namespace, agent: str) -> None:
     enable_compile_cache()
     protocol, (learner, own), scales = PROTOCOLS[arguments.tasks], AGENTS[agent], np.array(arguments.scales)
     given = {**protocol.settings[learner], **own}
-    given |= {name: value(x) for name, x in (word.split("=", 1) for word in arguments.training)}
+    given |= settings_of(arguments.training)
     plain = with_preset(protocol.env, learner, **varied(protocol.family, arguments.scales))
     iterations = arguments.steps or protocol.steps
     chunk = iterations // arguments.evaluations
@@ -186,8 +184,8 @@ def lines(found: dict[str, Any], agent: str) -> Iterator[list[str]]:
 def compared(own: np.ndarray, alone: np.ndarray | None) -> list[str]:
     """Return the cells of scores (S,), and of what they have less than the control's, if it has as many seeds."""
     known = alone is not None and len(alone) == len(own)
-    against = cell(stats.paired_difference(own, alone), "+.1f") if known else "-"  # type: ignore
-    return [cell(stats.seed_interval(own), ".1f"), against]
+    against = f"{stats.paired_difference(own, alone):+.1f}" if known else "-"  # type: ignore
+    return [f"{stats.seed_interval(own):.1f}", against]
 
 
 def scores_of(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

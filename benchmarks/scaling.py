@@ -5,7 +5,7 @@
     tasks     at equal total environments and batch
     envs      environments over 8 tasks, with the same updates a step
     seeds     in one program, the same steps of each
-    devices   with 40 seeds, which they share
+    devices   with 40 seeds, which they share; up to as many as there are
 
 Every setting is timed in a process of its own, right after the axis's base setting (10 tasks; the fewest environments;
 1 seed; 1 device) in the same process, in turn, round after round, so that other load on the machine affects both.
@@ -27,6 +27,9 @@ from pathlib import Path
 from typing import Any
 
 import parts
+from report import markdown, record, run_main, texts_of
+
+from mtjax.names import InputError
 
 # Values on a CPU, and on a GPU.
 AXES = {
@@ -57,26 +60,31 @@ def main() -> None:
     parser.add_argument("--part", nargs=2, metavar=("AXIS", "VALUE"), help="time this setting in this process")
     parts.add_flags(parser)
     arguments = parser.parse_args()
-    arguments.on = arguments.on or device_kind()
+    kind, count = (arguments.on, 0) if arguments.part else devices()
+    arguments.on = arguments.on or kind
     arguments.worlds = arguments.worlds or (4000 if arguments.on == "gpu" else 200)
     arguments.batch = arguments.batch or (4000 if arguments.on == "gpu" else 400)
     if arguments.part:
         measure(arguments, arguments.part[0], int(arguments.part[1]))
         return
-    left = parts.run_parts(__file__, [part(*each, arguments) for each in settings(arguments)], arguments.out, arguments)
+    of_all = [part(*each, arguments) for each in settings(arguments, count)]
+    left = parts.run_parts(__file__, of_all, arguments.out, arguments)
     tabulate(arguments)
     parts.require_all(left)
 
 
-def settings(arguments: argparse.Namespace) -> list[tuple[str, int]]:
-    """Return axes with their values, the base first: others on its axis are timed beside it."""
-    return [(axis, value) for axis in arguments.axes for value in AXES[axis][arguments.on == "gpu"]]
+def settings(arguments: argparse.Namespace, count: int) -> list[tuple[str, int]]:
+    """Return axes with their values, up to ``count`` devices, the base first: others are timed beside it."""
+    values = [(axis, value) for axis in arguments.axes for value in AXES[axis][arguments.on == "gpu"]]
+    return [(axis, value) for axis, value in values if axis != "devices" or value <= count]
 
 
-def device_kind() -> str:
-    """Return "gpu" or "cpu", as a process of its own finds, so that this one does not hold the device."""
-    found = subprocess.run([sys.executable, "-c", "import jax; print(jax.default_backend())"], capture_output=True)
-    return "gpu" if found.stdout.strip() == b"gpu" else "cpu"
+def devices() -> tuple[str, int]:
+    """Return "gpu" or "cpu", and how many, as a process of its own finds, so that this one does not hold them."""
+    code = "import jax; print(jax.default_backend(), jax.device_count())"
+    asked = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    kind, count = asked.stdout.split()
+    return "gpu" if kind == "gpu" else "cpu", int(count)
 
 
 def part(axis: str, value: int, arguments: argparse.Namespace) -> parts.Part:
@@ -85,24 +93,19 @@ def part(axis: str, value: int, arguments: argparse.Namespace) -> parts.Part:
 
 
 def measure(arguments: argparse.Namespace, axis: str, value: int) -> None:
-    """Time one setting beside its axis's base, and write its row. A machine with too few devices writes none."""
+    """Time one setting beside its axis's base, and write its row."""
     import jax
-    from report import record, run_main
 
-    def run() -> None:
-        if axis == "devices" and value > jax.device_count():
-            print(f"there are {jax.device_count()} devices")
-            return
-        base = contestant(axis, BASE[axis], arguments)
-        own = base if value == BASE[axis] else contestant(axis, value, arguments)
-        for _ in range(arguments.repeats):
-            base.time()
-            if own is not base:
-                own.time()
-        result = record(arguments, {"rows": [row(axis, value, own, base)]})
-        parts.write_result(arguments.out / f"{axis}-{value}.json", result)
-
-    run_main(run)
+    if axis == "devices" and value > jax.device_count():
+        raise InputError(f"this process sees {jax.device_count()} of {value} devices")
+    base = contestant(axis, BASE[axis], arguments)
+    own = base if value == BASE[axis] else contestant(axis, value, arguments)
+    for _ in range(arguments.repeats):
+        base.time()
+        if own is not base:
+            own.time()
+    result = record(arguments, {"rows": [row(axis, value, own, base)]})
+    parts.write_result(arguments.out / f"{axis}-{value}.json", result)
 
 
 def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Any:
@@ -115,7 +118,7 @@ def contestant(axis: str, value: int, arguments: argparse.Namespace) -> Any:
     num_tasks = {"tasks": value, "envs": _TASKS}.get(axis, 10)
     worlds = value if axis == "envs" else arguments.worlds
     seeds = {"seeds": value, "devices": _SEEDS}.get(axis, 1)
-    name, span = arguments.parameter.split("=", 1)
+    ((name, span),) = texts_of([arguments.parameter]).items()
     values = f"{span}:{num_tasks}" if num_tasks > 1 else f"{sum(map(float, span.split(':'))) / 2:g}"
     program = mtjax.preset(arguments.env, arguments.agent, vary={name: values}, split="none")
     experience: Any = program.learner.experience
@@ -173,8 +176,6 @@ def tabulate(arguments: argparse.Namespace) -> None:
 
 
 def table(rows: list[dict]) -> str:
-    from report import markdown
-
     head = ["worlds of a seed", "env-steps/s, all seeds", "range", "substeps/s", "updates/s", "cost", "compiled in"]
     cells = lambda row: [
         *(f"{row[name]:,}" for name in ("value", "worlds", "steps_per_second")),
@@ -205,4 +206,4 @@ def draw(path: Path, axis: str, rows: list[dict]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

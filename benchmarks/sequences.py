@@ -33,10 +33,8 @@ import jax.numpy as jnp
 import numpy as np
 import parts
 import resumable
-from learning import cell
 from matplotlib.figure import Figure
-from report import markdown, record, run_main, write_lines
-from returns import value
+from report import markdown, record, run_main, settings_of, write_lines
 
 from mtjax.agents.parts.plasticity import PLASTICITY
 from mtjax.compiling.programs import enable_compile_cache
@@ -129,10 +127,9 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
     """Learn the tasks by a method, or go on with the run that was stopped, and write the scores of all evaluations."""
     enable_compile_cache()
     name, *words = method.split(":")
-    given = {key: value(x) for key, x in (word.split("=", 1) for word in [*arguments.training, *words])}
     chunk, played = protocol.each // protocol.evaluations, protocol.tasks * protocol.rounds
     kind = "plasticity" if name in PLASTICITY and name != "none" else "continual"
-    given = {**_COMMON, **protocol.settings, kind: name, **given}
+    given = {**_COMMON, **protocol.settings, kind: name, **settings_of([*arguments.training, *words])}
     given |= {"curriculum": f"{protocol.curriculum}:{protocol.each}", "chunk_steps": chunk}
     plain = with_preset(protocol.env, protocol.agent, **protocol.family)
     agent, settings = configure(plain.learner, plain.training, given)
@@ -202,11 +199,11 @@ def row(method: str, found: dict[str, Measures]) -> list[str]:
     alone, plain = (None if method == name else found.get(name) for name in ("scratch", "none"))
     if alone is not None:
         gained = sequences.forward_transfer(own.areas, alone.areas.mean(axis=0))
-        transfer = cell(stats.seed_interval(np.nanmean(gained, axis=1)), ".2f")
+        transfer = f"{stats.seed_interval(np.nanmean(gained, axis=1)):.2f}"
     if plain is not None and len(plain.performance) == len(own.performance):
-        against = cell(stats.paired_difference(own.performance, plain.performance), ".2f")
+        against = f"{stats.paired_difference(own.performance, plain.performance):.2f}"
     shown = (own.performance, own.forgetting, own.areas.mean(axis=1))
-    return [method, *(cell(stats.seed_interval(x), ".2f") for x in shown), transfer, against]
+    return [method, *(f"{stats.seed_interval(x):.2f}" for x in shown), transfer, against]
 
 
 def curves(result: dict[str, Any]) -> list[dict[str, Any]]:

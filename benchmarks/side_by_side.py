@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from report import markdown, publish
+from report import markdown, publish, run_main
 
 from mtjax.report.stats import paired_difference
 
@@ -110,7 +110,7 @@ def curves(agent: str, other: Path, this: Path) -> list[list[str]]:
     for step in sorted(before.keys() & after.keys()):
         gap = paired_difference(after[step], before[step])
         same = np.array_equal(after[step], before[step])
-        shown = "the same bits" if same else f"{gap.point:+.2f} [{gap.low:+.2f}, {gap.high:+.2f}]"
+        shown = "the same bits" if same else f"{gap:+.2f}"
         means = [f"{x[step].mean():.2f}" for x in (before, after)]
         lines.append([agent, str(len(after[step])), f"{step:,}", *means, shown])
     if not lines:
@@ -163,4 +163,4 @@ def milliseconds(file: Path) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

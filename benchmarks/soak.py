@@ -19,7 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from report import machine, markdown
+from report import machine, markdown, run_main
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _RUN = (
@@ -66,7 +66,9 @@ def soak(seconds: float, flags: list[str]) -> tuple[list[float], int]:
             seen |= {str(path) for path in Path(runs).glob("*/checkpoints/*") if path.name.isdigit()}
             time.sleep(1 / _RATE)
         process.send_signal(signal.SIGTERM)
-        if process.wait(300) != 128 + signal.SIGTERM:
+        if process.wait(300) == -signal.SIGTERM:  # which it did not yet handle
+            sys.exit("the run was still compiling when the time was over; give more --minutes")
+        if process.returncode != 128 + signal.SIGTERM:
             sys.exit(f"the run ended by itself with code {process.returncode}")
     return samples, len(seen)
 
@@ -80,4 +82,4 @@ def judge(samples: list[float]) -> tuple[list[float], bool]:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

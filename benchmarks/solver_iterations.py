@@ -27,7 +27,7 @@ from mtjax.envs.engines.base import Engine, World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
 from mtjax.envs.physics import mjx_engine
-from mtjax.types import Task
+from mtjax.types import InputError, Task
 
 SETTINGS = ("1/2", "1/4", "2/4", "2/8", "3/6", "4/8", "6/12", "10/20")
 _HELD = 5  # control steps for which random play holds an action
@@ -76,7 +76,8 @@ def domains() -> list[str]:
 def measure(name: str, engines: tuple[str, ...], arguments: argparse.Namespace) -> Any:
     """Yield a row for every engine and setting of one environment."""
     env = mtjax.make(name)
-    assert isinstance(env, Domain)
+    if not isinstance(env, Domain):
+        raise InputError(f"{name!r} is no family of one MuJoCo model, such as finger-spin")
     sample = play(env, min(arguments.sample, arguments.worlds), arguments.play)
     for kind in engines:
         for setting in ("model",) if kind == "c" else arguments.settings:
@@ -89,7 +90,10 @@ def build(env: Domain, kind: str, setting: str) -> Engine:
     if kind == "c":
         return MujocoC(env.models, env.num_substeps)
     base = copy.copy(mjx_engine(env).base)
-    base.opt.iterations, base.opt.ls_iterations = map(int, setting.split("/"))
+    try:
+        base.opt.iterations, base.opt.ls_iterations = map(int, setting.split("/"))
+    except ValueError:
+        raise InputError(f"a setting is iterations/line-search iterations, such as 4/8, not {setting!r}") from None
     if kind == "mjx":
         return Mjx(base, env.num_substeps)
     from mtjax.envs.engines.warp import Warp

@@ -409,7 +409,7 @@ def over_games(agent: str, together: str, scores: list[np.ndarray]) -> list[str]
     each = np.concatenate([of_game[:seeds] for of_game in scores], axis=1)
     found = seed_interval(np.median(each, axis=1)), seed_interval(each, iqm), seed_interval(each)
     how = "with others" if together else "alone"
-    return [agent, how, str(each.shape[1]), *(learning.cell(x, ".3f") for x in found)]
+    return [agent, how, str(each.shape[1]), *(f"{x:.3f}" for x in found)]
 
 
 def compare(shared: Evaluations, row: int, alone: Evaluations) -> list[str]:
@@ -421,7 +421,7 @@ def compare(shared: Evaluations, row: int, alone: Evaluations) -> list[str]:
     if made < max(steps_a_task(shared)[0], steps_a_task(alone)[0]):
         return [f"{made:,.0f}", "-", "-", "-"]
     ours, theirs = returns_after(shared, made)[:, [row]], returns_after(alone, made)
-    gain = learning.cell(unpaired_difference(ours, theirs), "+.0f")
+    gain = f"{unpaired_difference(ours, theirs):+.0f}"
     return [f"{made:,.0f}", *(score(x, ".0f") for x in (ours, theirs)), gain]
 
 
@@ -440,7 +440,7 @@ def score(values: np.ndarray | None, form: str) -> str:
     """Return the mean of values (S, T) with its interval over seeds."""
     if values is None or not np.all(np.isfinite(values)):
         return "-"
-    return learning.cell(seed_interval(values), form)
+    return format(seed_interval(values), form)
 
 
 def short(env: str) -> str:

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import parts
-from report import markdown, record, run_main
-from returns import value
+from report import markdown, record, run_main, settings_of
 
 import mtjax
 from mtjax.compiling.programs import enable_compile_cache
@@ -102,7 +101,7 @@ def measure(arguments: argparse.Namespace, name: str, tasks: int) -> None:
     """Train on so many tasks of a family, and write what it earned."""
     enable_compile_cache()
     config = with_preset(name, arguments.agent, arguments.preset, split="none", **tasks_of(name, tasks))
-    given = {key: value(x) for key, x in (word.split("=", 1) for word in arguments.given)}
+    given = settings_of(arguments.given)
     agent, played = configure(config.learner, config.training, given)
     run = lambda **more: mtjax.train(
         *(config.family, agent),

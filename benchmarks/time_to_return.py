@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from report import markdown, publish
+from parts import end_of
+from report import markdown, publish, run_main, texts_of
 
 _ON_CPU = jax.default_backend() == "cpu"
 # Tasks that are many have few environments and small batches each, so that the whole stays the same.
@@ -54,7 +55,7 @@ def main() -> None:
 
 def measure(agent: str, num_tasks: int, arguments: argparse.Namespace) -> list[dict]:
     """Run one setting with a cold and a warm cache."""
-    name, span = arguments.parameter.split("=", 1)
+    ((name, span),) = texts_of([arguments.parameter]).items()
     words = [f"--env={arguments.env}", f"--agent={agent}", f"--env.vary.{name}={span}:{num_tasks}"]
     words += [f"--seeds={arguments.seeds}", "--eval-every=1000000000", "--eval-episodes=1"]
     words += (MANY if num_tasks >= 100 else []) + arguments.flags
@@ -71,17 +72,19 @@ def watch(words: list[str], place: Path, cache: str, arguments: argparse.Namespa
     """Start a run, follow its metrics until the mark is reached, and end it."""
     runs = place / f"runs-{cache}"
     command = [sys.executable, "-m", "mtjax.train", *words, f"--runs={runs}"]
-    log = (place / f"{cache}.log").open("w")
+    log = place / f"{cache}.log"
     before = time.monotonic()
-    process = subprocess.Popen(
-        command, env={**os.environ, "MTJAX_CACHE": str(place / "cache")}, stdout=log, stderr=subprocess.STDOUT
-    )
-    try:
-        return follow(process, runs, before, arguments)
-    finally:
-        process.send_signal(signal.SIGTERM)  # it ends after the chunk it is in, as it would for a user
-        process.wait()
-        log.close()
+    environment = {**os.environ, "MTJAX_CACHE": str(place / "cache")}
+    with log.open("w") as file:
+        process = subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+        try:
+            found = follow(process, runs, before, arguments)
+        finally:
+            process.send_signal(signal.SIGTERM)  # it ends after the chunk it is in, as it would for a user
+            process.wait()
+    if found["first_metrics"] is None:
+        raise SystemExit(f"no metrics came from mtjax.train {' '.join(words)}{end_of(log)}")
+    return found
 
 
 def follow(process: subprocess.Popen, runs: Path, before: float, arguments: argparse.Namespace) -> dict:
@@ -103,8 +106,6 @@ def follow(process: subprocess.Popen, runs: Path, before: float, arguments: argp
         reached = [seconds for seconds, total in known if total >= arguments.mark]
         if reached:
             found |= {"training": round(reached[0], 2), "reached": now}
-    if found["first_metrics"] is None:
-        raise SystemExit(f"the run ended before its first metrics; try it: {' '.join(process.args)}")  # type: ignore
     return found
 
 
@@ -133,4 +134,4 @@ def table(rows: list[dict], mark: float) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

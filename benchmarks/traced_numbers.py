@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import machine, markdown
+from report import machine, markdown, run_main
 
 import mtjax
 from mtjax.agents.swept import sweepable, with_numbers
@@ -83,4 +83,4 @@ def random_window() -> Transition:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

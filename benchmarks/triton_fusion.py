@@ -15,6 +15,7 @@ from importlib.metadata import version
 import jax
 import jax.numpy as jnp
 import numpy as np
+from report import run_main
 
 SEEDS, TASKS, ENVS, INPUTS, EXPERTS, WIDTH, HIDDEN = 10, 8, 5, 9, 4, 64, 256
 
@@ -100,4 +101,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -140,7 +140,8 @@ def size_of(tree: Any) -> int:
 
 
 def table(rows: list[dict]) -> str:
-    head = ["agent", "tasks", "seeds", "ms an update", "range", "over sac", "parameters", "compiled in"]
+    """Return the figures as a table, whose first row is of the agent that others are compared with."""
+    head = ["agent", "tasks", "seeds", "ms an update", "range", f"over {rows[0]['agent']}", "parameters", "compiled in"]
     cells = lambda row: [
         *(str(row[name]) for name in ("agent", "tasks", "seeds")),
         f"{row['milliseconds']:.3g}",

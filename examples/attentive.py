@@ -163,8 +163,7 @@ def draw(env: Grid, weights: np.ndarray, out: str) -> None:
 
 def tell(name: str, returns: np.ndarray) -> None:
     """Print the mean over tasks of returns (S, T), with its interval over seeds."""
-    point, low, high = stats.seed_interval(returns.mean(axis=1))
-    print(f"{name:28} {point:.2f} [{low:.2f}, {high:.2f}]", flush=True)
+    print(f"{name:28} {stats.seed_interval(returns.mean(axis=1)):.2f}", flush=True)
 
 
 def main() -> None:

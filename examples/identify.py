@@ -527,11 +527,8 @@ def main() -> None:
     for learners in found.values():
         *_, without = learners.values()
         for name, regrets in learners.items():
-            point, low, high = stats.seed_interval(regrets[:, -1])
             less = stats.paired_difference(regrets[:, -1], without[:, -1])
-            print(
-                f"{name:24} {point:6.1f} [{low:.1f}, {high:.1f}]  {less.point:+.1f} [{less.low:+.1f}, {less.high:+.1f}]"
-            )
+            print(f"{name:24} {stats.seed_interval(regrets[:, -1]):.1f}  {less:+.1f}")
     draw(found, arguments.out)
     print(f"written to {arguments.out}")
 

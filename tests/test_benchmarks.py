@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -338,6 +339,36 @@ def test_time_that_two_operations_share_counts_once(script):
     assert kernels.busy_seconds(operations) == 4
 
 
+def test_operations_are_what_computes(script):
+    """On a CPU a loop is recorded too, and covers what it holds."""
+    names = ["while", "while.3", "call_2", "conditional.1", "dot_1", "while_fusion", "custom-call.2"]
+    events = [
+        SimpleNamespace(name=name, stats=[("hlo_op", name)], start_ns=i, duration_ns=1e9)
+        for i, name in enumerate(names)
+    ]
+    thread = SimpleNamespace(name="tf_XLAEigen", events=[*events, SimpleNamespace(name="other", stats=[])])
+    data = SimpleNamespace(planes=[SimpleNamespace(name="/host:CPU", lines=[thread])])
+    assert [x.name for x in script("kernels").read(data)] == ["dot_1", "while_fusion", "custom-call.2"]
+
+
+def test_products_are_counted_with_their_loops(script):
+    """Two operations for each of 3 x 4 x 4 numbers, five times; and those of an update as it is timed."""
+    cost, trace = script("update_cost"), script("update_trace")
+    scan = lambda x, w: jax.lax.scan(lambda x, _: (x @ w, None), x, length=5)[0]
+    assert trace.matrix_flops(jax.make_jaxpr(scan)(np.ones((3, 4)), np.ones((4, 4)))) == 5 * 2 * 3 * 4 * 4
+    agent, tasks, keys = mtjax.agent("sac", hidden=(8,)), cost.tasks_of(2), jax.random.split(jax.random.key(0), 1)
+    state = jax.eval_shape(jax.vmap(lambda key: agent.init(cost.SPEC, tasks, key)), keys)
+    update = cost.updates(agent, tasks, cost.random_window(cost.SPEC, 2, 4), 3)
+    found = trace.matrix_flops(jax.make_jaxpr(update)(state, keys))
+    assert found > 0 and found % 3 == 0
+
+
+def test_ratios_are_named_after_the_agent_that_they_are_to(script):
+    row = {"agent": "drq", "tasks": 2, "seeds": 1, "milliseconds": 1.0, "fastest": 1.0, "slowest": 1.0}
+    row |= {"over_sac": 1.0, "parameters": 3, "compile_seconds": 1.0}
+    assert "| over drq |" in script("update_cost").table([row])
+
+
 @pytest.mark.parametrize(
     "samples, flat",
     [
@@ -555,7 +586,7 @@ def test_a_suites_agents_see_its_pictures(script, agent):
     """Agents whose subject is something else encode the pictures."""
     suite, learning = script("suite"), script("learning")
     pixels = suite.SUITES["pixels"]
-    settings = {name: script("returns").value(x) for name, x in (pair.split("=") for pair in pixels.settings)}
+    settings = script("report").settings_of(pixels.settings)
     program = mtjax.preset(pixels.envs[0], agent, "gpu", learning.seeing(agent, settings), **settings)
     require_sight(program.learner, program.family.spec)
     assert program.learner.representation.sees_pictures
@@ -735,6 +766,36 @@ def test_an_interrupted_benchmark_ends_without_a_traceback(script, capsys):
     assert getattr(stop.value, "code", None) == 130 and capsys.readouterr().err == "interrupted\n"
 
 
+def test_wrong_input_ends_every_benchmark_with_one_line():
+    """All commands are run by what turns an error of input into a line."""
+    commands = {file.name: file.read_text() for file in FOLDER.glob("*.py") if "ArgumentParser(" in file.read_text()}
+    assert len(commands) > 25 and not [name for name, text in commands.items() if "    run_main(main)\n" not in text]
+
+
+def test_settings_are_words_with_an_equals_sign(script):
+    """What is behind it is read as JSON if it is some."""
+    settings_of, found = script("report").settings_of, {"hidden": (8, 8), "tau": 0.1, "engine": "c", "arguments": "a=b"}
+    assert settings_of(["hidden=[8,8]", "tau=0.1", "engine=c", "arguments=a=b"]) == found
+    with pytest.raises(InputError, match="'tau' is no setting; write NAME=VALUE"):
+        settings_of(["engine=c", "tau"])
+    with pytest.raises(InputError, match=r"--grid takes numbers: .*'x'"):
+        script("presets").grid(["tau=0.1,x"])
+
+
+@pytest.mark.parametrize("name", ["compare", "parts", "ppo_peer", "rejax_peer", "scaling"])
+def test_benchmarks_whose_parts_hold_the_device_import_no_jax(name):
+    code = f"import sys; sys.path.insert(0, {str(FOLDER)!r}); import {name}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_brax_sac_says_what_it_lacks_before_it_measures(script, monkeypatch):
+    brax_sac = script("brax_sac")
+    monkeypatch.setattr(sys, "argv", ["brax_sac.py"])
+    monkeypatch.setattr(brax_sac.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="pip install playground"):
+        brax_sac.main()
+
+
 @pytest.mark.parametrize("seconds", [3.6, 41.0, 63.0])
 def test_seconds_of_compiling_are_read_as_a_run_tells_them(script, seconds):
     told = f"compiling\ncompiled in {duration(seconds)}\n"
@@ -777,3 +838,22 @@ def test_halving_is_compared_on_the_same_trials(script):
         script("halving").compared(whole, halved)
     halved["trials"].append(trial(4))
     assert script("halving").compared(whole, halved) == [9.0, 8.0, 2, 0.25, 2, 2]
+
+
+@pytest.mark.slow
+def test_kernels_of_an_update_are_listed(script, monkeypatch, capsys):
+    flags = ["--agents", "sac", "--tasks", "2", "--batch", "4", "--hidden", "8"]
+    monkeypatch.setattr(sys, "argv", ["kernels.py", *flags])
+    script("kernels").main()
+    told = capsys.readouterr().out
+    assert "| dot |" in told and "| while |" not in told and "\n| sac | 1 |" in told
+
+
+@pytest.mark.slow
+def test_updates_are_timed_with_their_numbers_as_data(script, monkeypatch, capsys):
+    numbers = script("traced_numbers")
+    for name, small in {"TASKS": 2, "BATCH": 4, "UPDATES": 2, "ROUNDS": 1}.items():
+        monkeypatch.setattr(numbers, name, small)
+    monkeypatch.setattr(sys, "argv", ["traced_numbers.py", "--agents", "sac"])
+    numbers.main()
+    assert capsys.readouterr().out.splitlines()[2].startswith("| sac | ")

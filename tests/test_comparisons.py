@@ -53,7 +53,8 @@ def test_parts_without_a_result_run_and_others_do_not(module, tmp_path, capfd):
     assert parts.run_parts(str(script), of_all, out, flags()) == ["fails"]
     found = {x["name"]: x["device"] for x in parts.read_results(out)}
     assert found["a"] == "old" and set(found) == {"a", "b", "c"} and {found["b"], found["c"]} <= {"0", "1"}
-    assert "no" in (out / "fails.log").read_text() and "fails: no result" in capfd.readouterr().out
+    told = capfd.readouterr().out
+    assert "fails: no result after" in told and f"see {out / 'fails.log'}: no\n" in told
 
 
 def test_a_part_is_stopped_when_the_time_is_over(module, tmp_path):
@@ -79,6 +80,16 @@ def test_parts_stop_with_the_program_that_started_them(module, tmp_path):
         time.sleep(0.05)
     process.terminate()
     assert process.wait(20) == 128 + signal.SIGTERM and not (tmp_path / "a.log").exists()
+
+
+def test_a_part_that_begins_as_all_are_stopped_is_stopped(module, tmp_path, monkeypatch):
+    """The stop came when its process was not yet among those that run."""
+    parts, script, begin = module("parts"), tmp_path / "script.py", subprocess.Popen
+    script.write_text(_SCRIPT.format(folder=str(FOLDER)))
+    runner = parts._Runner(str(script), tmp_path, float("inf"), float("inf"))
+    monkeypatch.setattr(parts.subprocess, "Popen", lambda *words, **given: (runner.stop(), begin(*words, **given))[1])
+    runner.play(parts.Part("lasts", ["lasts", str(tmp_path)]), "0")
+    assert not (tmp_path / "lasts.json").exists()
 
 
 def peer_result(side, seed, times, returns, cold, compiling=30.0):
@@ -145,10 +156,11 @@ def test_figures_have_their_origin(module, tmp_path, monkeypatch):
 def test_scaling_has_a_row_for_every_result_and_begins_parts_with_their_settings(module, tmp_path, monkeypatch):
     """Each names its folder, also where that is named after the clock, and the device whose values it takes."""
     scaling, parts = module("scaling"), module("parts")
-    arguments = argparse.Namespace(axes=["seeds"], on="cpu", out=tmp_path, plots=tmp_path / "plots", json=None)
+    axes = ["seeds", "devices"]
+    arguments = argparse.Namespace(axes=axes, on="cpu", out=tmp_path, plots=tmp_path / "plots", json=None)
     monkeypatch.setattr(sys, "argv", ["scaling.py", "--axes", "seeds"])
-    of_all = [scaling.part(*each, arguments) for each in scaling.settings(arguments)]
-    assert [x.name for x in of_all] == ["seeds-1", "seeds-2", "seeds-4"]
+    of_all = [scaling.part(*each, arguments) for each in scaling.settings(arguments, 2)]
+    assert [x.name for x in of_all] == ["seeds-1", "seeds-2", "seeds-4", "devices-1", "devices-2"]  # there are no four
     assert of_all[1].words[2:] == ["--on", "cpu", "--out", str(tmp_path), "--part", "seeds", "2"]
     line = {"axis": "seeds", "worlds": 8, "steps_per_second": 1000, "substeps_per_second": 2000, "slowest": 1}
     line |= {"fastest": 2, "updates_per_second": 3.0, "compile_seconds": 4.0}
@@ -169,6 +181,25 @@ def test_playground_has_a_second_row_where_its_substeps_differ(module):
     default, ours = steps.playground_physics("FingerSpin", own)
     assert default[2].substeps == 4 and ours[2] == own and ours[1] == {"sim_dt": 0.01}
     assert len(steps.playground_physics("CheetahRun", steps.Physics(1, 0.01, "euler"))) == 1
+
+
+def test_a_run_without_metrics_tells_why_it_ended(module, tmp_path):
+    given = argparse.Namespace(patience=60.0, seeds=1, mark=900.0)
+    with pytest.raises(SystemExit, match=r"no metrics came from mtjax.train --agent=foo: .*unknown agent 'foo'"):
+        module("time_to_return").watch(["--agent=foo"], tmp_path, "cold", given)
+
+
+def test_solver_iterations_are_those_of_a_mujoco_model(module):
+    with pytest.raises(mtjax.InputError, match="'link' is no family of one MuJoCo model"):
+        next(module("solver_iterations").measure("link", ("c",), argparse.Namespace()))
+
+
+def test_a_file_without_curves_is_told(module, tmp_path):
+    published, (none, other) = module("published"), (tmp_path / "none.csv", tmp_path / "other.csv")
+    other.write_text("family,steps\nfish-swim,3\n")
+    for file in (none, other):
+        with pytest.raises(mtjax.InputError, match=rf"{file.name}' is no file with lines of family, seconds, return"):
+            published.read(file)
 
 
 def test_a_family_is_learned_by_its_share_of_what_is_published(module):

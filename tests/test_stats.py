@@ -6,6 +6,7 @@ import pytest
 from mtjax.names import InputError
 from mtjax.report.stats import (
     Bootstrap,
+    Interval,
     holm,
     iqm,
     paired_difference,
@@ -24,6 +25,11 @@ def random_scores(num_seeds, num_tasks=10, seed=7):
 
 def width(interval):
     return interval.high - interval.low
+
+
+def test_an_interval_is_written_only_if_there_is_one():
+    assert f"{Interval(1.5, 1.0, 2.0):+.1f}" == "+1.5 [+1.0, +2.0]"
+    assert f"{seed_interval(np.array([1.0, 2.0])):.2f}" == "1.50"
 
 
 @pytest.mark.parametrize(

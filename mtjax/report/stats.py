@@ -18,11 +18,18 @@ Statistic = Callable[..., np.ndarray]  # takes an array and ``axis``, as ``iqm``
 
 
 class Interval(NamedTuple):
-    """A statistic and the bounds of its interval. The bounds are nan if there are too few seeds for an interval."""
+    """A statistic and the bounds of its interval. The bounds are nan if there are too few seeds for an interval.
+
+    Formats such as ``.2f`` are those of its numbers: ``1.50 [1.00, 2.00]``, or ``1.50`` without an interval.
+    """
 
     point: float
     low: float
     high: float
+
+    def __format__(self, form: str) -> str:
+        point, low, high = (format(x, form) for x in self)
+        return f"{point} [{low}, {high}]" if np.isfinite(self.low) else point
 
 
 class Bootstrap(NamedTuple):

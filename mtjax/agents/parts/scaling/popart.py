@@ -51,7 +51,8 @@ class PopArt(NoScaling):
         parts.require_rates(self, "target_rate")
 
     def init(self, num_tasks: int) -> Estimates:
-        return Estimates(*Moments.begin(num_tasks), *jnp.zeros((2, num_tasks)), jnp.zeros(num_tasks, bool))
+        none = jnp.zeros(num_tasks)
+        return Estimates(*Moments.begin(num_tasks), none, none, jnp.zeros(num_tasks, bool))
 
     def observe(self, memory: Estimates, steps: Transition) -> Estimates:
         """Set the first units by the rewards before learning; after that, targets alone move them."""
