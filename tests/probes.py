@@ -100,6 +100,7 @@ class Goals(Walk):
     relabels = ("scale",)
     parameters = ("scale",)
     varied = ("scale",)
+    pixels, repeat = 0, 1
 
     def tasks(self, split="train"):
         tasks = tasks_of("one-step", (1.0, 2.0, 3.0, 4.0), self.episode_length)

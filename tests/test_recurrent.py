@@ -65,8 +65,8 @@ def test_states_over_a_window_are_those_of_steps_one_by_one():
             np.testing.assert_allclose(after[world, t], following, atol=1e-5)
             hidden = jnp.where(step.closed, knowing.begin(3, 2), one(hidden, step))
     features = lambda past: knowing.features(params, jnp.zeros(0), dataclasses.make_dataclass("Seen", ["past"])(past))
-    np.testing.assert_array_equal(features(track), found[0])
-    np.testing.assert_array_equal(features(Following(*track)), found[1])
+    for past, state in ((track, found[0]), (Following(*track), found[1])):  # another program, which may round otherwise
+        np.testing.assert_allclose(features(past), state, rtol=0, atol=2.5e-7)
 
 
 class Ratios(PPO):

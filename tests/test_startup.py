@@ -242,7 +242,8 @@ def test_fields_of_models_are_those_of_mjx():
         ("0.11.2", True, f"--{TILINGS}=top=1", f"--{TILINGS}=top=1"),
         ("0.11.2", False, "", ""),
         ("0.10.1", True, "", ""),
-        ("0.12.0", True, "", ""),
+        ("0.12.0.1", True, "", f"--{TILINGS}=top=4,top_from_default=1"),
+        ("0.13.0", True, "", ""),
     ],
 )
 def test_xla_is_given_only_a_flag_that_it_knows(monkeypatch, version, gpu, given, expected):

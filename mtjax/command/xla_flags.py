@@ -4,7 +4,7 @@ import os
 from importlib import metadata, util
 
 _TILINGS = "xla_gpu_experimental_cost_model_gemm_tiling_options"
-_FIRST, _BEYOND = (0, 10, 2), (0, 12)  # versions of jaxlib: both ends of what is between know the flag
+_FIRST, _BEYOND = (0, 10, 2), (0, 13)  # versions of jaxlib: both ends of what is between know the flag
 
 
 def try_few_tilings() -> None:
