@@ -107,13 +107,6 @@ class Variation:
         return tuple(made[row] for row in rows)
 
 
-def drawn_in_episodes(listed: Variation) -> Variation:
-    """Return a variation of one training task, whose episodes draw what the training tasks of ``listed`` have."""
-    rows = listed.rows["train"]
-    draws = rows if listed.draws is None else listed.draws.reshape(-1, len(listed.names))
-    return dataclasses.replace(listed, rows={**listed.rows, "train": rows[:1]}, draws=draws[None])
-
-
 def write_values(given: str | float | Sequence[float], name: str = "a parameter") -> str:
     """Return a parameter's values in the notation of the command line.
 

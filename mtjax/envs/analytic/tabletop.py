@@ -2,20 +2,18 @@
 
 import dataclasses
 from collections.abc import Mapping
-from functools import cached_property
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
+from mtjax.envs.drawn_goals import DrawnGoals
 from mtjax.envs.family import Family
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, positive
 from mtjax.envs.pixels import Mark, Pictured
-from mtjax.envs.variation import Variation, drawn_in_episodes
-from mtjax.names import nearest_error
 from mtjax.types import Array, Key, Step, Task, Transition
 
 _HALF = 2.8  # [m] half a side of the table
@@ -33,7 +31,6 @@ _REACHED = 0.2  # [m] within which gripper and object together are where they sh
 _LEFT = 0.1  # [m] within which the object is, so that the gripper goes home
 _CLOSE = 0.4  # [m] that is magnified to 1
 _SCATTER = 0.1  # [m] by which starts differ along each axis
-_REWARDS = ("dense", "sparse")
 _PAINTS = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.2, 0.2, 1.0), (0.2, 0.7, 0.3, 1.0), (0.2, 0.4, 0.9, 1.0), (0.9, 0.8, 0.3, 1.0))
 
 
@@ -47,7 +44,7 @@ class TableState(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Tabletop(Pictured, Family):
+class Tabletop(DrawnGoals, Pictured, Family):
     """Tabletop: bring an object to its goal with a gripper, leave it there, and bring the gripper home.
 
     EARL's tabletop manipulation (Sharma et al. 2022, "Autonomous reinforcement learning: formalism and benchmarking"),
@@ -82,10 +79,6 @@ class Tabletop(Pictured, Family):
     close; our dense reward leads the gripper home too, and the sparse one comes without demonstrations.
     """
 
-    context_ranges: Any = ()
-    reward_kind: str = "dense"
-    """dense: rewards show the way; or sparse: only where all is where it should be."""
-
     parameters: ClassVar[Mapping[str, Parameter]] = MappingProxyType(
         {
             "goal": Parameter("1", 0.0, minimum=-1e-8, maximum=len(_NAMES) - 1, names=_NAMES),
@@ -93,23 +86,12 @@ class Tabletop(Pictured, Family):
             "pace": positive("m", 0.2),
         }
     )
-    relabels: ClassVar[tuple[str, ...]] = ("goal",)
     asks: ClassVar[str] = "Bring the object to its goal, and the gripper home."
     episode_steps: ClassVar[int] = 200
     action_size: ClassVar[int] = 3
     step_seconds: ClassVar[float] = 0.1
     film_speed: ClassVar[float] = 2.0
     look: ClassVar[Look | None] = Look(camera=(0.0, 0.0, 7.5), tilt=0.0, light=(0.0, 0.0, 8.0), diffuse=0.6, sun=True)
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.reward_kind not in _REWARDS:
-            raise nearest_error("reward-kind", self.reward_kind, _REWARDS)
-
-    @cached_property
-    def variation(self) -> Variation:
-        """Return the values of the only training task, and as its draws those of all that are listed."""
-        return drawn_in_episodes(Family.variation.func(self))  # type: ignore
 
     def reset(self, task: Task, key: Key) -> Step:
         moved = jax.random.uniform(key, (2, 2), jnp.float32, -_SCATTER, _SCATTER)

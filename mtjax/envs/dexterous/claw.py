@@ -2,26 +2,23 @@
 
 import dataclasses
 import math
-from functools import cached_property
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
 from mtjax.envs.domain import Domain
+from mtjax.envs.drawn_goals import DrawnGoals
 from mtjax.envs.engines.base import World
 from mtjax.envs.looks import Look
 from mtjax.envs.parameters import DAMPING, FRICTION, MASS, STRENGTH, Parameter, not_negative
 from mtjax.envs.pixels import Mark
-from mtjax.envs.variation import Variation, drawn_in_episodes
-from mtjax.names import nearest_error
 from mtjax.types import Array, Key, Task, Transition
 
 _REACHED = 0.1  # [rad] within which the valve is where it should be
 _SCATTER = 0.1  # [rad] by which starts differ
-_REWARDS = ("dense", "sparse")
 _RING = 0.15  # [m] from the axis to the mark of the goal
 _HEIGHT = 0.03  # [m] of the valve
 
@@ -31,7 +28,7 @@ def _set_valve_friction(spec: mujoco.MjSpec, value: float) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Claw(Domain):
+class Claw(DrawnGoals, Domain):
     """Claw: turn a valve of three prongs to an angle with three fingers, and hold it there.
 
     After the claw of ROBEL (Ahn et al. 2019), with a smaller body of our own. One push turns the valve by some half a
@@ -62,10 +59,6 @@ class Claw(Domain):
         strength: scale of the motors' torques.
     """
 
-    context_ranges: Any = ()
-    reward_kind: str = "dense"
-    """dense: rewards show the way; or sparse: only where the valve is where it should be."""
-
     asks: ClassVar[str] = "Turn the valve until its marked prong is at the goal."
     parameters: ClassVar = MappingProxyType(
         {
@@ -81,18 +74,7 @@ class Claw(Domain):
     num_substeps: ClassVar[int] = 8
     episode_steps: ClassVar[int] = 100
     starts_untouched: ClassVar[bool] = True
-    relabels: ClassVar[tuple[str, ...]] = ("goal",)
     look: ClassVar = Look((0.0, -0.42, 0.5), 40.0, light=(0, 0, 1.5))
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.reward_kind not in _REWARDS:
-            raise nearest_error("reward-kind", self.reward_kind, _REWARDS)
-
-    @cached_property
-    def variation(self) -> Variation:
-        """Return the values of the only training task, and as its draws those of all that are listed."""
-        return drawn_in_episodes(Domain.variation.func(self))  # type: ignore
 
     def start(self, task: Task, key: Key) -> tuple[Array, Array]:
         qpos = jax.random.uniform(key, (self.models[0].nq,), jnp.float32, -_SCATTER, _SCATTER)
