@@ -84,18 +84,15 @@ def measure(arguments: argparse.Namespace, way: str) -> None:
         eval_every=steps // arguments.evaluations,
         eval_episodes=arguments.episodes,
     )
-    found, last = result.evaluations, result.rows[-1]
+    found = result.evaluations
     rounded = lambda scores: np.asarray(np.round(np.float64(scores["train"].mean(axis=(2, 3))), 5)).tolist()
     figures = {
         "way": way,
         "success": rounded(found.metrics["success"]),
         "success_ever": rounded(found.metrics["success_ever"]),
         "returns": rounded(found.returns),
-        "steps": found.steps.tolist(),
-        "training_seconds": round(float(last["seconds"]), 1),
-        "wall_seconds": round(float(last["wall_seconds"]), 1),
         "loop": str(settings),
-        "learner": str(result.agent),
+        **resumable.summary(result),
     }
     parts.write_result(arguments.out / f"{way}.json", record(arguments, figures))
     shutil.rmtree(folder, ignore_errors=True)

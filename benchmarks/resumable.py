@@ -34,3 +34,14 @@ def train(folder: Path, family: Env, agent: Agent, seconds: float = math.inf, **
     if result.signal:
         raise SystemExit(f"stopped: the run is in {folder}, and the same command with the same --out goes on with it")
     return result._replace(rows=read_lines(folder / "metrics.csv"))
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Return what every record of a run has: steps of its evaluations, seconds by two clocks, and the agent."""
+    last = result.rows[-1]
+    return {
+        "steps": result.evaluations.steps.tolist(),
+        "training_seconds": round(float(last["seconds"]), 1),
+        "wall_seconds": round(float(last["wall_seconds"]), 1),
+        "learner": str(result.agent),
+    }

@@ -139,18 +139,15 @@ def measure(arguments: argparse.Namespace, agent: str) -> None:
         eval_every=chunk * worlds,
         eval_episodes=arguments.episodes,
     )
-    found, last = result.evaluations, result.rows[-1]
+    found = result.evaluations
     returns = found.returns["train"].mean(axis=-1, dtype=np.float64) / scales
     figures = {
         "agent": agent,
         "control": is_control,
         "scales": arguments.scales,
         "returns": np.round(returns, 4).tolist(),
-        "steps": found.steps.tolist(),
-        "training_seconds": round(float(last["seconds"]), 1),
-        "wall_seconds": round(float(last["wall_seconds"]), 1),
         "loop": str(settings),
-        "learner": str(result.agent),
+        **resumable.summary(result),
     }
     parts.write_result(arguments.out / f"{name}.json", record(arguments, figures))
     shutil.rmtree(folder, ignore_errors=True)

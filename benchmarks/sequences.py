@@ -144,7 +144,7 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
         eval_every=chunk * settings.num_envs,
         eval_episodes=protocol.episodes,
     )
-    found, last = result.evaluations, result.rows[-1]
+    found = result.evaluations
     scores = found.returns["train"] / protocol.best if protocol.best else found.metrics["success_ever"]["train"]
     figures = {
         "method": method,
@@ -153,10 +153,7 @@ def measure(arguments: argparse.Namespace, protocol: Protocol, out: Path, method
         "returns": rounded(found.returns["train"], 2),
         "tasks": plain.family.labels("train"),
         "order": [int(settings.plays.rows(jnp.int32(i * protocol.each), protocol.tasks)[0]) for i in range(played)],
-        "steps": found.steps.tolist(),
-        "training_seconds": round(float(last["seconds"]), 1),
-        "wall_seconds": round(float(last["wall_seconds"]), 1),
-        "learner": str(result.agent),
+        **resumable.summary(result),
     }
     parts.write_result(out / f"{name_of(method)}.json", record(arguments, figures))
     shutil.rmtree(folder, ignore_errors=True)

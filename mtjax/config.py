@@ -117,7 +117,7 @@ class RunConfig:
     teacher: Annotated[Any, tyro.conf.Suppress] = None
     search: int = 0
     """Look for good real numbers of the agent in so many trials. Ranges are flags such as --agent.actor-lr=1e-5..1e-2.
-    A round of trials trains as one program, of which the better half goes on at each of --search-rungs (pip install
+    A round of trials trains as one program. At each of --search-rungs its better half goes on (pip install
     'mtjax[search]'). The search's folder holds a table of all trials; --resume takes this folder."""
     search_batch: int = 0
     """Trials of a round. 0 means a quarter of all."""

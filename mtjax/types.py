@@ -321,7 +321,7 @@ class Relabelling(Protocol):
     @property
     def varied(self) -> tuple[str, ...]: ...  # the parameters that differ between tasks
     @property
-    def relabels(self) -> tuple[str, ...]: ...  # those that are goals, which ``relabel`` can exchange
+    def relabels(self) -> tuple[str, ...]: ...  # the goals, which ``relabel`` can exchange
     @property
     def fresh_goals(self) -> bool: ...  # whether every episode draws a goal of its own, whatever its task
     @property

@@ -138,7 +138,9 @@ def _with_rungs(config: RunConfig, batch: int, most: int) -> tuple[RunConfig, tu
         plan = dataclasses.replace(plan, eval_every=-(-plan.steps // parts))
     shortest = max(plan.interval // config.worlds, config.learner.experience.steps)
     training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, shortest))
-    plain = dataclasses.replace(config, plan=plan, training=training, search=0, search_batch=0, search_rungs=3)
+    plain = dataclasses.replace(
+        config, plan=plan, training=training, search=0, search_batch=0, search_rungs=RunConfig.search_rungs
+    )
     return plain, searching.rungs(plan.steps, batch, max(plan.interval, plain.steps_per_chunk), most)
 
 
