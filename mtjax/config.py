@@ -135,6 +135,9 @@ class RunConfig:
     wandb: str = ""
     """Name of the Weights & Biases project to log to, with one run for each seed (pip install 'mtjax[wandb]').
     WANDB_MODE=offline keeps the logs in the run's folder."""
+    trackio: str = ""
+    """Name of the trackio project to log to, with one run for each seed (pip install 'mtjax[trackio]'). It is on this
+    machine, where `trackio show` opens it, or in the Hugging Face Space that TRACKIO_SPACE_ID names."""
     view: int = 0
     """Show the run on a page of this machine while it lasts: its curves, and its newest policy in worlds that move. The
     number is the page's port; --view alone takes 8008."""

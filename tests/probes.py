@@ -284,7 +284,8 @@ def train_objects(env, agent, **given):
     """Train quietly, in a folder too, also what no name makes again. ``given`` are fields of hooks and settings."""
     hooks = Hooks(**{"quiet": True, **{name: given.pop(name) for name in Hooks._fields if name in given}})
     plan = {name: given.pop(name) for name in Plan.__dataclass_fields__ if name in given}
-    more = {name: given.pop(name) for name in ("settings", "sweep", "profile", "tensorboard", "wandb") if name in given}
+    written = ("settings", "sweep", "profile", "tensorboard", "wandb", "trackio")
+    more = {name: given.pop(name) for name in written if name in given}
     config = configured(env, agent, given, plan=plan, start=hooks.start, **more)
     check(config, hooks.start)
     return launch(config, hooks)

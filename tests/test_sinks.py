@@ -1,6 +1,9 @@
-"""Metrics for TensorBoard and Weights & Biases, beside metrics.csv."""
+"""Metrics for TensorBoard, Weights & Biases and trackio, beside metrics.csv."""
 
+import json
+import os
 import re
+import subprocess
 import sys
 import types
 
@@ -13,10 +16,11 @@ from mtjax.types import InputError
 
 SMALL = {"num_envs": 2, "chunk_steps": 25, "batch_size": 4, "replay_size": 200, "warmup_steps": 5, "hidden": (8, 8)}
 PLAN = {"steps": 200, "seeds": 2, "eval_every": 100, "eval_episodes": 1}
+ASKED = [("tensorboardX", {"tensorboard": True}), ("wandb", {"wandb": "project"}), ("trackio", {"trackio": "project"})]
 
 
 class Recorder:
-    """Stands for both libraries, and keeps what it is given."""
+    """Stands for all three libraries, and keeps what it is given."""
 
     def __init__(self):
         self.opened, self.written, self.closed = [], [], 0
@@ -24,7 +28,7 @@ class Recorder:
 
         class Writer:
             def __init__(self, *place, **given):
-                self.place = given.get("name") or place[0].rsplit("/", 1)[-1]
+                self.place = given.get("name") or place[min(1, len(place) - 1)].rsplit("/", 1)[-1]
                 recorder.opened.append((self.place, given))
 
             def add_scalar(self, name, value, step):
@@ -45,14 +49,14 @@ class Recorder:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("library, given", [("tensorboardX", {"tensorboard": True}), ("wandb", {"wandb": "project"})])
+@pytest.mark.parametrize("library, given", ASKED)
 def test_every_number_is_logged_at_its_step(library, given, short_family, tmp_path, monkeypatch):
     """A run for each seed, with the rows of metrics.csv and the evaluations by split."""
     recorder = Recorder()
     monkeypatch.setitem(sys.modules, library, recorder.module)
     folder = tmp_path / "run"
     result = mtjax.train("finger-short", "sac-conditioned", directory=folder, **PLAN, **SMALL, **given)
-    prefix = "run-" if library == "wandb" else ""
+    prefix = "" if library == "tensorboardX" else "run-"
     assert [place for place, _ in recorder.opened] == [f"{prefix}seed-0", f"{prefix}seed-1"] and recorder.closed == 2
     told = {(place, step, name): value for place, step, name, value in recorder.written}
     for row in result.rows:
@@ -66,7 +70,7 @@ def test_every_number_is_logged_at_its_step(library, given, short_family, tmp_pa
 @needs("tensorboardX")
 def test_tensorboard_writes_files_that_its_reader_reads(tmp_path):
     """By the real library."""
-    found = sinks.open_sinks(tmp_path, True, "", 0, {})
+    found = sinks.open_sinks(tmp_path, True, "", "", 0, {})
     row = {"seed": 0, "steps": 5, "return": "2.5", "loss": "", "td_error_0": "1", "td_error_12": "2"}
     sinks.write_rows(found, [row], ["seed-0"])
     found[0].close()
@@ -80,14 +84,37 @@ def test_tensorboard_writes_files_that_its_reader_reads(tmp_path):
 def test_wandb_logs_offline(tmp_path, monkeypatch):
     """By the real library, without a network."""
     monkeypatch.setenv("WANDB_MODE", "offline")
-    found = sinks.open_sinks(tmp_path, False, "project", 0, {"steps": 5})
+    found = sinks.open_sinks(tmp_path, False, "project", "", 0, {"steps": 5})
     rows = [{"seed": seed, "steps": 5, "return": "2.5"} for seed in range(2)]
     sinks.write_rows(found, rows, ["seed-0", "seed-1"])
     found[0].close()
     assert len(list((tmp_path / "wandb").glob("offline-run-*"))) == 2
 
 
-@pytest.mark.parametrize("library, given", [("tensorboardX", {"tensorboard": True}), ("wandb", {"wandb": "project"})])
+@pytest.mark.slow
+@needs("trackio")
+def test_trackio_keeps_the_runs_of_two_seeds_and_of_a_resumed_one(tmp_path):
+    """By the real library, in a process of its own, as it reads its folder once."""
+    script = f"""
+from pathlib import Path
+from mtjax.training import sinks
+for step in (5, 10):
+    (found,) = sinks.open_sinks(Path({str(tmp_path / "run")!r}), False, "", "project", step - 5, {{"steps": 10}})
+    rows = [{{"seed": seed, "steps": step, "return": str(seed + step)}} for seed in range(2)]
+    sinks.write_rows([found], rows, ["seed-0", "seed-1"])
+    found.close()
+"""
+    environment = os.environ | {"TRACKIO_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    for seed in range(2):
+        words = ["trackio", "get", "metric", "--project=project", f"--run=run-seed-{seed}", "--metric=return", "--json"]
+        found = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+        values = [(x["step"], x["value"]) for x in json.loads(found.stdout)["values"]]
+        assert values == [(5, 5.0 + seed), (10, 10.0 + seed)]
+
+
+@pytest.mark.parametrize("library, given", ASKED)
 def test_a_missing_library_is_named_before_anything_compiles(library, given, short_family, tmp_path, monkeypatch):
     """With what to install."""
     monkeypatch.setitem(sys.modules, library, None)

@@ -29,6 +29,7 @@ class _Told:
     profile: bool
     tensorboard: bool
     wandb: str
+    trackio: str
     quiet: bool
     label: str
 
@@ -52,6 +53,7 @@ def train(
     profile: bool = False,
     tensorboard: bool = False,
     wandb: str = "",
+    trackio: str = "",
     quiet: bool = False,
     label: str = "",
     on_chunk: Callable[[dict[str, Any]], Any] | None = None,
@@ -91,6 +93,7 @@ def train(
         profile: write a trace of one chunk by ``jax.profiler`` into ``directory``/profile.
         tensorboard: write metrics for TensorBoard into ``directory``/tensorboard.
         wandb: name of a Weights & Biases project to log to.
+        trackio: name of a trackio project to log to.
         quiet: print nothing. Else progress is a bar on a terminal, and lines elsewhere, as in notebooks.
         label: the first words of progress lines.
         on_chunk: a function that is called with each chunk's first row of metrics. If it returns True, the run stops
@@ -105,10 +108,11 @@ def train(
     begun = _begun(start, agent)
     if on_chunk is not None and not callable(on_chunk):
         raise InputError(f"on_chunk is a function of a row of metrics, not {shown(on_chunk)}")
-    written = {"profile": profile, "tensorboard": tensorboard, "wandb": wandb}
+    written = {"profile": profile, "tensorboard": tensorboard, "wandb": wandb, "trackio": trackio}
     checked(_Told, {"resume": resume, **written, "quiet": quiet, "label": label})
     if directory is None and (resume or any(written.values())):
-        raise InputError("resume, profile, tensorboard and wandb need the run's folder; give directory as well")
+        names = ", ".join(["resume", *written])
+        raise InputError(f"{names} need the run's folder; give directory as well")
     plan = {"seeds": seeds, "seed": seed, "eval_every": eval_every, "eval_episodes": eval_episodes}
     plan |= {"population": population}
     plan |= {} if steps is None else {"steps": steps}

@@ -40,7 +40,7 @@ def configured(
         plan: the fields of ``Plan``.
         settings: settings of the training loop; by default those of the preset, or ``Settings()`` for an object.
         start: the policy to fine-tune, or those that teach.
-        written: profile, tensorboard and wandb.
+        written: profile, tensorboard, wandb and trackio.
 
     Raises:
         InputError: there is no such setting, a value is not allowed, or settings do not go together.

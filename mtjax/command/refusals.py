@@ -15,7 +15,8 @@ from mtjax.names import PRESETS, InputError, nearest_error
 from mtjax.saved import pretrained
 
 _MAY_CHANGE = {  # the only flags beside --resume
-    *("--resume", "--steps", "--import", "--distributed", "--profile", "--tensorboard", "--view", "--wandb")
+    *("--resume", "--steps", "--import", "--distributed", "--profile", "--view"),
+    *("--tensorboard", "--trackio", "--wandb"),
 }
 
 

@@ -109,6 +109,7 @@ def _from_record(record: Any) -> RunConfig:
         imports=_imports(record),
         tensorboard=record.get("tensorboard", False),
         wandb=record.get("wandb", ""),
+        trackio=record.get("trackio", ""),
         plan=Plan(**record["plan"]),
         training=Settings(**record["training"]),
         learner=agent(record["agent"], **record["learner"]),
@@ -194,6 +195,7 @@ def to_flags(config: RunConfig) -> list[str]:
     words = [f"--env={config.env}", f"--agent={config.agent}", *import_flags(config)]
     words += [f"--from={config.start}"] if config.start else []
     words += ["--tensorboard"] * config.tensorboard + [f"--wandb={config.wandb}"] * bool(config.wandb)
+    words += [f"--trackio={config.trackio}"] * bool(config.trackio)
     found = {"--": {**_fields(config.plan), **_fields(config.training)}, "--env.": _family_settings(config.family)}
     for prefix, items in found.items():
         words += itertools.chain(*(_flag(prefix, name.replace("_", "-"), value) for name, value in items.items()))

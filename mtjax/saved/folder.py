@@ -106,6 +106,7 @@ def resumed_config(config: RunConfig, directory: Path, argv: Sequence[str]) -> R
     steps = config.plan.steps if extended else recorded.plan.steps
     now: dict[str, Any] = {"plan": dataclasses.replace(recorded.plan, steps=steps)}
     now |= {"tensorboard": recorded.tensorboard or config.tensorboard, "wandb": config.wandb or recorded.wandb}
+    now |= {"trackio": config.trackio or recorded.trackio}
     now |= {"view": config.view, "profile": config.profile, "distributed": config.distributed}
     return recorded.checked(**now)
 

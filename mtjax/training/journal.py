@@ -100,7 +100,8 @@ class Journal:
                 assert self.hooks.directory is not None
                 config, agent = self.config, settings_of(self.config.trained)
                 told = {**dataclasses.asdict(config.plan), **dataclasses.asdict(config.played), **agent}
-                sinks = open_sinks(self.hooks.directory, config.tensorboard, config.wandb, steps, told)
+                asked = config.tensorboard, config.wandb, config.trackio
+                sinks = open_sinks(self.hooks.directory, *asked, steps, told)
             for sink in sinks:
                 opened.callback(sink.close)
             yield sinks

@@ -9,7 +9,6 @@ import jax
 
 from mtjax.agents import preset_of
 from mtjax.agents.combinations import require_sight
-from mtjax.checks import require_library
 from mtjax.config import RunConfig
 from mtjax.envs import Family
 from mtjax.envs.contexts import ranges
@@ -24,6 +23,7 @@ from mtjax.training.distillation import require_teachers
 from mtjax.training.finetune import require_start
 from mtjax.training.journal import NO_HOOKS, Hooks
 from mtjax.training.run import train
+from mtjax.training.sinks import require_sinks
 from mtjax.types import InputError
 
 
@@ -50,8 +50,7 @@ def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> 
             f"{lost} steps on the host of one device, and this run is on {config.mesh.size}; show JAX one, such "
             "as by CUDA_VISIBLE_DEVICES=0"
         )
-    for module in ["tensorboardX"] * config.tensorboard + ["wandb"] * bool(config.wandb):
-        require_library(module)
+    require_sinks(config.tensorboard, config.wandb, config.trackio)
 
 
 def _require_named(config: RunConfig) -> None:

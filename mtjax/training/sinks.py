@@ -1,7 +1,11 @@
-"""Metrics of a run for TensorBoard and Weights & Biases, beside metrics.csv. Each seed is a run of its own there."""
+"""Metrics of a run for TensorBoard, Weights & Biases and trackio, beside metrics.csv. Each seed is a run of its own."""
 
+import contextlib
+import contextvars
+import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -40,38 +44,78 @@ class TensorBoard:
             writer.close()
 
 
-class WandB:
-    """Logs to a project of Weights & Biases: one run for each seed, in a group of the folder's name."""
+class SeedRuns:
+    """Logs to a library that keeps runs: one for each seed, which ``begin`` opens by its name."""
 
-    def __init__(self, project: str, directory: Path, config: Mapping[str, Any]):
-        self.module = require_library("wandb")
-        self.project, self.directory, self.config, self.runs = project, directory, dict(config), {}
+    def __init__(self, begin: Callable[[str], Any]):
+        self.begin, self.runs = begin, {}
 
     def write(self, run: str, steps: int, values: Mapping[str, float]) -> None:
         """Log numbers of a seed."""
         if run not in self.runs:
-            name = f"{self.directory.name}-{run}"
-            self.runs[run] = self.module.init(
-                project=self.project,
-                group=self.directory.name,
-                name=name,
-                id=name.replace("/", "-")[-120:],
-                resume="allow",
-                dir=str(self.directory),
-                config={**self.config, "run": run},
-                reinit="create_new",
-                settings=self.module.Settings(silent=True, console="off"),
-            )
+            with _silence():
+                self.runs[run] = self.begin(run)
         self.runs[run].log(dict(values), step=steps)
 
     def close(self) -> None:
         """Finish the runs."""
         for run in self.runs.values():
-            run.finish()
+            with _silence():
+                run.finish()
+
+
+def _silence() -> Any:
+    """Return a context in which a library prints nothing on standard output, which has the run's progress."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def wandb_runs(project: str, directory: Path, config: Mapping[str, Any]) -> SeedRuns:
+    """Return runs in a project of Weights & Biases, in a group of the folder's name."""
+    module = require_library("wandb")
+
+    def begin(run: str) -> Any:
+        name = f"{directory.name}-{run}"
+        return module.init(
+            project=project,
+            group=directory.name,
+            name=name,
+            id=name.replace("/", "-")[-120:],
+            resume="allow",
+            dir=str(directory),
+            config={**config, "run": run},
+            reinit="create_new",
+            settings=module.Settings(silent=True, console="off"),
+        )
+
+    return SeedRuns(begin)
+
+
+def trackio_runs(project: str, directory: Path, config: Mapping[str, Any]) -> SeedRuns:
+    """Return runs in a project of trackio, in a group of the folder's name."""
+    module = require_library("trackio")
+
+    def begin(run: str) -> Any:
+        settings = {"resume": "allow", "embed": False, "auto_log_gpu": False, "auto_log_cpu": False}
+        told = {**config, "run": run}
+        begin = partial(module.init, project, f"{directory.name}-{run}", directory.name, config=told, **settings)
+        return contextvars.Context().run(begin)  # as one context has one run, and ends it when another begins
+
+    return SeedRuns(begin)
+
+
+def require_sinks(tensorboard: bool, wandb: str, trackio: str) -> None:
+    """Check that the libraries of the sinks that a run asks for are installed.
+
+    Raises:
+        InputError: one is missing.
+    """
+    asked = {"tensorboardX": tensorboard, "wandb": wandb, "trackio": trackio}
+    for module in (name for name, wanted in asked.items() if wanted):
+        require_library(module)
 
 
 def open_sinks(
-    directory: Path, tensorboard: bool, wandb: str, first_step: int, config: Mapping[str, Any]
+    directory: Path, tensorboard: bool, wandb: str, trackio: str, first_step: int, config: Mapping[str, Any]
 ) -> list[Sink]:
     """Return the sinks that a run asked for.
 
@@ -82,7 +126,8 @@ def open_sinks(
         InputError: a library is missing.
     """
     sinks: list[Sink] = [TensorBoard(directory, first_step)] if tensorboard else []
-    return [*sinks, WandB(wandb, directory, config)] if wandb else sinks
+    sinks += [wandb_runs(wandb, directory, config)] if wandb else []
+    return sinks + ([trackio_runs(trackio, directory, config)] if trackio else [])
 
 
 def write_rows(sinks: Sequence[Sink], rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
