@@ -64,7 +64,7 @@ def test_steps_of_gymnax_are_the_originals(name, settings, kinds):
 
         def original(state, action, params=params):
             given = action if family.discrete else low + (action + 1) / 2 * (high - low)
-            _, _, reward, terminated, truncated, info = environment.step(state.key, state.world, given, params)
+            _, _, reward, terminated, truncated, info = environment.step(state.step_key, state.world, given, params)
             return info["final_observation"].astype(jnp.float32).ravel(), reward, terminated, truncated
 
         ours, theirs = play(family, task, original)
@@ -97,7 +97,7 @@ def test_steps_of_craftax_are_the_originals(name, settings):
         params = own_params(nominal, task, max_timesteps=family.episode_length)
 
         def original(state, action, params=params):
-            obs, world, reward, over, _ = environment.step(state.key, state.world, action, params)
+            obs, world, reward, over, _ = environment.step(state.step_key, state.world, action, params)
             return obs, reward, over, _is_dead(world)
 
         ours, theirs = play(family, task, original)

@@ -14,7 +14,7 @@ from mtjax.config import configure
 from mtjax.experience import Replay
 from mtjax.learning import loop
 from mtjax.learning.loop import Settings
-from mtjax.learning.rollout import broadcast_tasks, reset_envs, step_envs
+from mtjax.learning.rollout import bounded_worlds, broadcast_tasks, reset_envs, step_envs
 from mtjax.parallel.axes import over_learners, over_worlds
 from mtjax.types import Acted, InputError, Spec
 
@@ -218,6 +218,16 @@ def test_the_episode_of_a_lost_world_is_cut_off(monkeypatch, value):
     np.testing.assert_array_equal(metrics["lost"], lost.sum(axis=(1, 2))[None])
     np.testing.assert_array_equal(metrics["episodes"], np.sum(np.floor(rows.obs[..., 0]) == 4, axis=(1, 2))[None])
     np.testing.assert_array_equal(metrics["bad_step"], [[-1, -1]])
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.nan, np.inf, -np.inf, 1.1e10, -1.1e10])
+@pytest.mark.parametrize("size", [1, 3, 33, 400])
+def test_one_number_beyond_the_bound_is_seen_wherever_it_is(value, size):
+    """In one of two arrays of an observation; the bound itself is within."""
+    obs = {"a": np.random.RandomState(0).normal(size=(1, 2, size, size)).astype(np.float32)}
+    obs |= {"b": np.full((1, 2, size, 2, 2), -1e10, np.float32), "c": np.full((1, 2, size), 2**31 - 1)}
+    obs["a"][0, 1, np.arange(size), np.arange(size)] = value
+    np.testing.assert_array_equal(jax.jit(bounded_worlds)(obs), [[[True] * size, [False] * size]])
 
 
 def test_worlds_that_are_lost_often_are_a_bad_step():

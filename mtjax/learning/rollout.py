@@ -202,7 +202,9 @@ def step_envs(
 def bounded_worlds(obs: Any) -> Array:
     """Return which worlds (S, T, E) have observations, leaves (S, T, E, ...), of finite numbers within the bound."""
     floats = [x for x in jax.tree.leaves(obs) if jnp.issubdtype(x.dtype, jnp.floating)]
-    within = [jnp.all(jnp.abs(x) <= _LARGEST, axis=tuple(range(3, x.ndim))) for x in floats]
+    # A CPU sums floats far faster than it finds whether all of many are true; its maximum may leave out a NaN.
+    beyond = lambda x: jnp.sum(~(jnp.abs(x) <= _LARGEST), axis=tuple(range(3, x.ndim)), dtype=jnp.float32)
+    within = [beyond(x) == 0 for x in floats]
     return jnp.all(jnp.stack(within), axis=0) if within else jnp.ones(jax.tree.leaves(obs)[0].shape[:3], bool)
 
 

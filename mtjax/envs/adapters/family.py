@@ -20,10 +20,16 @@ _MOST_STEPS = 1_000_000
 
 
 class AdaptedState(NamedTuple):
-    """The state of a world, and the key of the chances to come: environments draw at every step."""
+    """The state of a world, and what gives every step of an episode a key of its own."""
 
     world: Any
-    key: Key
+    key: Key  # of the episode
+    steps: Array  # () int32, taken in it
+
+    @property
+    def step_key(self) -> Key:
+        """Return the key of the next step. Packages that draw nothing there do not pay for it."""
+        return jax.random.fold_in(self.key, self.steps)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,13 +109,13 @@ class Adapted(Acting, Family):
         """Begin an episode of ``task`` in a fresh random state."""
         start_key, key = jax.random.split(key)
         world, obs = self.begin(task, start_key)
-        return _strong_step(AdaptedState(world, key), obs, jnp.float32(0), jnp.bool_(False), jnp.bool_(False))
+        begun = AdaptedState(world, key, jnp.int32(0))
+        return _strong_step(begun, obs, jnp.float32(0), jnp.bool_(False), jnp.bool_(False))
 
     def step(self, task: Task, state: AdaptedState, action: Array) -> Step:
         """Advance one step under ``action``; observation and reward are those after it."""
-        world, obs, reward, terminated, truncated = self.advance(task, state.world, action, state.key)
-        key = jax.random.split(state.key)[1]
-        return _strong_step(AdaptedState(world, key), obs, reward, terminated, truncated)
+        world, *outcome = self.advance(task, state.world, action, state.step_key)
+        return _strong_step(state._replace(world=world, steps=state.steps + 1), *outcome)
 
     def own_params(self, task: Task) -> Any:
         """Return the package's parameters of a task, in the package's types."""
