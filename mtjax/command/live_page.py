@@ -46,7 +46,7 @@ def page(port: int, directory: Path, imports: Sequence[str]) -> Iterator[None]:
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         env=os.environ | {"JAX_PLATFORMS": "cpu"},
-        start_new_session=True,  # Ctrl-C is for the run alone
+        process_group=0,  # Ctrl-C is for the run alone; in a session of its own Linux would not heed the priority
     )
     try:
         os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
