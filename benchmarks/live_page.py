@@ -1,19 +1,19 @@
-"""How much its page slows a run: seconds of training with ``--view`` beside those without.
+"""How much a page slows the run that it shows: training with ``--view`` while somebody looks, and while nobody does.
 
-    python benchmarks/live_page.py [--repeats 5] [--pages without closed open] [--json FILE] [-- --env=... --agent=...]
+    python benchmarks/live_page.py [--pairs 15] [--span 12] [--json FILE] [-- --env=... --agent=...]
 
-Without flags after ``--`` it trains by ``--quick``. Each repeat trains once without a page, once with a page that
-nobody looks at, and once with one that is open: then this program asks for the numbers every other second and reads the
-pictures of the moving worlds, as a browser does. Only a browser's own drawing is left out. The order changes from
-repeat to repeat, and a ratio is to the run without a page of the same repeat. Seconds are those of all chunks but the
-first, without compiling, evaluations and checkpoints; the ratio by the clock has these too, but what compiles before
-the first line of metrics.
+One run trains, by ``--quick`` with shorter chunks and with an evaluation every 200,000 steps unless other flags follow
+``--``. For ``--span`` seconds the page is open: this program asks for its numbers every other second and reads the
+pictures of the moving worlds, as a browser does, but draws nothing itself. For as long nobody looks, and so on in turn.
+What else the machine does so falls on both alike. The ratio is that of the median time of an iteration in two such
+spans beside each other. The page's processor time while nobody looks is counted too.
 """
 
 import argparse
 import contextlib
 import http.client
 import os
+import signal
 import socket
 import statistics
 import subprocess
@@ -22,67 +22,92 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
-from report import markdown, publish, read_lines, run_main
+from report import publish, read_lines, run_main
 
 HERE = Path(__file__).resolve().parent.parent
-PAGES = ("without", "closed", "open")
-_CLOCKS = ("seconds", "wall_seconds")
+_RUN = "--quick --chunk-steps=25 --eval-every=200000 --steps=1000000000".split()
+_TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--pages", nargs="+", choices=PAGES, default=PAGES)
+    parser.add_argument("--pairs", type=int, default=15)
+    parser.add_argument("--span", type=float, default=12.0, help="seconds")
     parser.add_argument("--json", help="write the figures to this file")
     words = [*sys.argv[1:], "--"]
     arguments = parser.parse_args(words[: words.index("--")])
-    arguments.flags = words[words.index("--") + 1 : -1] or ["--quick"]
-    rows = []
-    with tempfile.TemporaryDirectory() as place:
-        train(arguments.flags, "without", Path(place) / "first", Path(place))  # fills the cache of programs
-        for repeat in range(arguments.repeats):
-            for page in turned(arguments.pages, repeat):
-                runs = Path(place) / f"{page}-{repeat}"
-                rows.append({"repeat": repeat, "page": page, **train(arguments.flags, page, runs, Path(place))})
-                print(rows[-1], flush=True)
-    print(table(rows))
+    arguments.flags = words[words.index("--") + 1 : -1] or _RUN
+    with training(arguments.flags) as (metrics, port, page):
+        rows = [pair(metrics, port, page, arguments.span) for _ in range(arguments.pairs)]
+    ratios = [row["ratio"] for row in rows]
+    quarters = statistics.quantiles(ratios, n=4)
+    idle = statistics.median(row["page_seconds"] for row in rows) / arguments.span
+    print(f"looked at, an iteration takes {quarters[1]:.2f} [{quarters[0]:.2f}, {quarters[2]:.2f}] times as long")
+    print(f"not looked at, the page takes {idle:.1%} of a core")
     publish(arguments, rows)
 
 
-def turned(pages: list[str], repeat: int) -> list[str]:
-    """Return the pages in an order that begins with another one in each repeat."""
-    first = repeat % len(pages)
-    return [*pages[first:], *pages[:first]]
+@contextlib.contextmanager
+def training(flags: list[str]) -> Iterator[tuple[Path, int, int]]:
+    """Give the metrics of a run that has learned for a while, and its page's port and process."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with tempfile.TemporaryDirectory() as runs:
+        words = [sys.executable, "-m", "mtjax.train", f"--runs={runs}", f"--view={port}", *flags]
+        environment = {**os.environ, "PYTHONPATH": str(HERE)}
+        process = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL)
+        try:
+            while not list(Path(runs).glob("*/checkpoints/*")) and process.poll() is None:
+                time.sleep(0.1)
+            if process.returncode:
+                raise SystemExit(f"{' '.join(words)} failed")
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            yield next(Path(runs).glob("*/metrics.csv")), port, int(children[-1])
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait()
 
 
-def train(flags: list[str], page: str, runs: Path, place: Path) -> dict[str, float]:
-    """Train once, and return the seconds of the chunks after the first, and how many pictures were read."""
-    port, ended, pictures = free_port(), threading.Event(), []
-    words = [sys.executable, "-m", "mtjax.train", f"--runs={runs}", *flags]
-    words += [f"--view={port}"] * (page != "without")
-    environment = {**os.environ, "PYTHONPATH": str(HERE), "MTJAX_CACHE": str(place / "cache")}
-    readers = [threading.Thread(target=look, args=(port, ended, pictures)) for look in (ask, watch)]
-    readers *= page == "open"
-    with subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as process:
-        for reader in readers:
-            reader.start()
-        process.wait()
+def pair(metrics: Path, port: int, page: int, span: float) -> dict[str, float]:
+    """Return figures of a span in which the page is open, and of one in which nobody looks."""
+    ended, pictures = threading.Event(), []
+    readers = [threading.Thread(target=read, args=(port, ended, pictures)) for read in (ask, watch)]
+    for reader in readers:
+        reader.start()
+    looked = milliseconds(metrics, span)
     ended.set()
     for reader in readers:
         reader.join()
-    if process.returncode:
-        raise SystemExit(f"{' '.join(words)} failed")
-    (file,) = runs.glob("*/metrics.csv")
-    lines = read_lines(file)
-    return {name: float(lines[-1][name]) - float(lines[0][name]) for name in _CLOCKS} | {"pictures": len(pictures)}
+    time.sleep(1)
+    before = processor_seconds(page)
+    alone = milliseconds(metrics, span)
+    row = {
+        "looked_at_milliseconds": looked,
+        "alone_milliseconds": alone,
+        "ratio": looked / alone,
+        "page_seconds": processor_seconds(page) - before,
+        "pictures_a_second": len(pictures) / span,
+    }
+    print(row, flush=True)
+    return row
 
 
-def free_port() -> int:
-    """Return a port that no program has."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
+def milliseconds(metrics: Path, span: float) -> float:
+    """Return the median time of an iteration of the chunks that end in a span that begins now."""
+    before = len(read_lines(metrics))
+    time.sleep(span)
+    lines = [line for line in read_lines(metrics) if line["seed"] == "0"][before:]
+    made = lambda name: [float(after[name]) - float(line[name]) for line, after in zip(lines, lines[1:], strict=False)]
+    return 1000 * statistics.median(s / n for s, n in zip(made("seconds"), made("iteration"), strict=True))
+
+
+def processor_seconds(process: int) -> float:
+    """Return the processor time that a process has taken."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def ask(port: int, ended: threading.Event, _: list[float]) -> None:
@@ -93,33 +118,14 @@ def ask(port: int, ended: threading.Event, _: list[float]) -> None:
 
 
 def watch(port: int, ended: threading.Event, pictures: list[float]) -> None:
-    """Read the stream of pictures, and note when each of them came."""
+    """Read the stream of pictures until the span ends, and note when each of them came."""
     while not ended.wait(0.2):
         with contextlib.suppress(OSError, http.client.HTTPException):
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/worlds", timeout=30) as stream:
-                pictures += (time.time() for line in stream if line == b"Content-Type: image/jpeg\r\n")
-
-
-def table(rows: list[dict]) -> str:
-    """Return the ratios to the run without a page of the same repeat: the median and the range."""
-    found = []
-    for page in dict.fromkeys(row["page"] for row in rows):
-        mine = [row for row in rows if row["page"] == page]
-        cells = [shown([row[clock] / base(rows, row)[clock] for row in mine]) for clock in _CLOCKS]
-        seconds = statistics.median(row["seconds"] for row in mine)
-        found.append([page, f"{seconds:.1f}", *cells, str(statistics.median(row["pictures"] for row in mine))])
-    head = ["page", "seconds of training", "ratio", "ratio by the clock, with evaluations", "pictures"]
-    return markdown(head, found)
-
-
-def base(rows: list[dict], row: dict) -> dict:
-    """Return the row without a page of the same repeat."""
-    return next(other for other in rows if (other["page"], other["repeat"]) == ("without", row["repeat"]))
-
-
-def shown(ratios: list[float]) -> str:
-    """Return the median of ratios, and their range."""
-    return f"{statistics.median(ratios):.2f} [{min(ratios):.2f}, {max(ratios):.2f}]"
+                for line in stream:
+                    pictures += [time.time()] * line.startswith(b"Content-Type")
+                    if ended.is_set():
+                        break
 
 
 if __name__ == "__main__":
