@@ -5,8 +5,8 @@
 One run trains, by ``--quick`` with shorter chunks and with an evaluation every 200,000 steps unless other flags follow
 ``--``. For ``--span`` seconds the page is open: this program asks for its numbers every other second and reads the
 pictures of the moving worlds, as a browser does, but draws nothing itself. For as long nobody looks, and so on in turn.
-What else the machine does so falls on both alike. The ratio is that of the median time of an iteration in two such
-spans beside each other. The page's processor time while nobody looks is counted too.
+What else the machine does so falls on both alike. The ratio is that of the mean time of an iteration in two such
+spans beside each other, without evaluations and checkpoints. The page's processor time is counted too.
 """
 
 import argparse
@@ -22,7 +22,7 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from report import publish, read_lines, run_main
@@ -44,14 +44,16 @@ def main() -> None:
         rows = [pair(metrics, port, page, arguments.span) for _ in range(arguments.pairs)]
     ratios = [row["ratio"] for row in rows]
     quarters = statistics.quantiles(ratios, n=4)
-    idle = statistics.median(row["page_seconds"] for row in rows) / arguments.span
+    share = lambda name: statistics.median(row[name] for row in rows) / arguments.span
     print(f"looked at, an iteration takes {quarters[1]:.2f} [{quarters[0]:.2f}, {quarters[2]:.2f}] times as long")
-    print(f"not looked at, the page takes {idle:.1%} of a core")
+    print(
+        f"the page takes {share('page_seconds_looked_at'):.1%} of a core, {share('page_seconds_alone'):.1%} while alone"
+    )
     publish(arguments, rows)
 
 
 @contextlib.contextmanager
-def training(flags: list[str]) -> Iterator[tuple[Path, int, int]]:
+def training(flags: Sequence[str]) -> Iterator[tuple[Path, int, int]]:
     """Give the metrics of a run that has learned for a while, and its page's port and process."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -77,7 +79,8 @@ def pair(metrics: Path, port: int, page: int, span: float) -> dict[str, float]:
     readers = [threading.Thread(target=read, args=(port, ended, pictures)) for read in (ask, watch)]
     for reader in readers:
         reader.start()
-    looked = milliseconds(metrics, span)
+    begun, looked = processor_seconds(page), milliseconds(metrics, span)
+    drawing = processor_seconds(page) - begun
     ended.set()
     for reader in readers:
         reader.join()
@@ -88,7 +91,8 @@ def pair(metrics: Path, port: int, page: int, span: float) -> dict[str, float]:
         "looked_at_milliseconds": looked,
         "alone_milliseconds": alone,
         "ratio": looked / alone,
-        "page_seconds": processor_seconds(page) - before,
+        "page_seconds_looked_at": drawing,
+        "page_seconds_alone": processor_seconds(page) - before,
         "pictures_a_second": len(pictures) / span,
     }
     print(row, flush=True)
@@ -96,12 +100,19 @@ def pair(metrics: Path, port: int, page: int, span: float) -> dict[str, float]:
 
 
 def milliseconds(metrics: Path, span: float) -> float:
-    """Return the median time of an iteration of the chunks that end in a span that begins now."""
-    before = len(read_lines(metrics))
+    """Return the mean time of an iteration of the chunks that end in a span that begins now."""
+    first = of_first_seed(metrics)[-1]
     time.sleep(span)
-    lines = [line for line in read_lines(metrics) if line["seed"] == "0"][before:]
-    made = lambda name: [float(after[name]) - float(line[name]) for line, after in zip(lines, lines[1:], strict=False)]
-    return 1000 * statistics.median(s / n for s, n in zip(made("seconds"), made("iteration"), strict=True))
+    last = of_first_seed(metrics)[-1]
+    made = lambda name: float(last[name]) - float(first[name])
+    if not made("iteration"):
+        raise SystemExit("no chunk ended in a span; give shorter chunks or a longer --span")
+    return 1000 * made("seconds") / made("iteration")
+
+
+def of_first_seed(metrics: Path) -> list[dict[str, str]]:
+    """Return the lines of metrics of a run's first seed."""
+    return [line for line in read_lines(metrics) if line["seed"] == "0"]
 
 
 def processor_seconds(process: int) -> float:
