@@ -29,6 +29,7 @@ from report import publish, read_lines, run_main
 
 HERE = Path(__file__).resolve().parent.parent
 _RUN = "--quick --chunk-steps=25 --eval-every=200000 --steps=1000000000".split()
+_TAKEN = "page_seconds_looked_at", "page_seconds_alone"  # of a processor
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -39,16 +40,16 @@ def main() -> None:
     parser.add_argument("--json", help="write the figures to this file")
     words = [*sys.argv[1:], "--"]
     arguments = parser.parse_args(words[: words.index("--")])
+    if arguments.pairs < 2:
+        parser.error("--pairs must be at least 2, as ratios have a range")
     arguments.flags = words[words.index("--") + 1 : -1] or _RUN
     with training(arguments.flags) as (metrics, port, page):
         rows = [pair(metrics, port, page, arguments.span) for _ in range(arguments.pairs)]
     ratios = [row["ratio"] for row in rows]
     quarters = statistics.quantiles(ratios, n=4)
-    share = lambda name: statistics.median(row[name] for row in rows) / arguments.span
+    open_share, idle_share = (statistics.median(row[name] for row in rows) / arguments.span for name in _TAKEN)
     print(f"looked at, an iteration takes {quarters[1]:.2f} [{quarters[0]:.2f}, {quarters[2]:.2f}] times as long")
-    print(
-        f"the page takes {share('page_seconds_looked_at'):.1%} of a core, {share('page_seconds_alone'):.1%} while alone"
-    )
+    print(f"the page takes {open_share:.1%} of a core while it is open, and {idle_share:.1%} while nobody looks")
     publish(arguments, rows)
 
 
@@ -91,8 +92,7 @@ def pair(metrics: Path, port: int, page: int, span: float) -> dict[str, float]:
         "looked_at_milliseconds": looked,
         "alone_milliseconds": alone,
         "ratio": looked / alone,
-        "page_seconds_looked_at": drawing,
-        "page_seconds_alone": processor_seconds(page) - before,
+        **dict(zip(_TAKEN, (drawing, processor_seconds(page) - before), strict=True)),
         "pictures_a_second": len(pictures) / span,
     }
     print(row, flush=True)

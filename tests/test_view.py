@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import json
+import os
 import re
 import shutil
 import signal
@@ -88,6 +89,8 @@ def test_the_numbers_are_those_of_the_runs_files(finished_run, server):
     assert status == 200 and headers["Content-Type"] == "application/json"
     assert (told["title"], told["seeds"], told["total"]) == ("sac-conditioned on finger-short", 2, 600)
     assert (told["steps"], told["left"], told["running"]) == (600, 0, False)
+    span = [float(rows[-1][name]) - float(rows[0][name]) for name in ("steps", "seconds")]
+    assert told["rate"] == pytest.approx(told["seeds"] * span[0] / span[1])
     steps = sorted({int(row["steps"]) for row in rows})
     assert told["curves"]["steps"] == steps
     for name in ("return", "critic_loss"):
@@ -100,6 +103,7 @@ def test_the_numbers_are_those_of_the_runs_files(finished_run, server):
     for split, x in evaluations.returns.items():
         np.testing.assert_allclose(told["scores"]["return"][split], x.mean(axis=(0, 2, 3)), rtol=1e-6)
     train = [task for task in told["tasks"] if task["split"] == "train"]
+    assert told["task_steps"] == steps and len(train[0]["curve"]) == len(steps)
     assert [(task["task"], task["label"]) for task in train] == [(0, "1"), (1, "1.2")]
     for t, task in enumerate(train):
         assert task["scored"] == pytest.approx(evaluations.returns["train"][:, -1, t].mean())
@@ -335,6 +339,18 @@ def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
     assert f"see it live at http://{HOME}:{free}\n" in capsys.readouterr().out
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((HOME, free))
+
+
+def test_a_page_gives_way_to_its_run(tmp_path, monkeypatch):
+    """Linux heeds a priority among the processes of a session; in a group of its own Ctrl-C leaves the page alone."""
+    made, begin = [], subprocess.Popen
+    monkeypatch.setattr(live_page.subprocess, "Popen", lambda _, **given: made.append(begin("cat", **given)) or made[0])
+    own, priority = os.getpid(), lambda process: os.getpriority(os.PRIO_PROCESS, process)
+    with live_page.page(8008, tmp_path, []):
+        page = made[0].pid
+        assert os.getsid(page) == os.getsid(own) and os.getpgid(page) == page != os.getpgid(own)
+        assert priority(page) == min(priority(own) + 10, 19)
+    assert made[0].returncode == 0
 
 
 @pytest.mark.parametrize("how", ["closed", "interrupted"])
