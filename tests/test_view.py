@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import json
+import os
 import re
 import shutil
 import signal
@@ -88,6 +89,8 @@ def test_the_numbers_are_those_of_the_runs_files(finished_run, server):
     assert status == 200 and headers["Content-Type"] == "application/json"
     assert (told["title"], told["seeds"], told["total"]) == ("sac-conditioned on finger-short", 2, 600)
     assert (told["steps"], told["left"], told["running"]) == (600, 0, False)
+    span = [float(rows[-1][name]) - float(rows[0][name]) for name in ("steps", "seconds")]
+    assert told["rate"] == pytest.approx(told["seeds"] * span[0] / span[1])
     steps = sorted({int(row["steps"]) for row in rows})
     assert told["curves"]["steps"] == steps
     for name in ("return", "critic_loss"):
@@ -100,6 +103,7 @@ def test_the_numbers_are_those_of_the_runs_files(finished_run, server):
     for split, x in evaluations.returns.items():
         np.testing.assert_allclose(told["scores"]["return"][split], x.mean(axis=(0, 2, 3)), rtol=1e-6)
     train = [task for task in told["tasks"] if task["split"] == "train"]
+    assert told["task_steps"] == steps and len(train[0]["curve"]) == len(steps)
     assert [(task["task"], task["label"]) for task in train] == [(0, "1"), (1, "1.2")]
     for t, task in enumerate(train):
         assert task["scored"] == pytest.approx(evaluations.returns["train"][:, -1, t].mean())
@@ -337,6 +341,18 @@ def test_training_does_not_notice_its_page(tmp_path, free, monkeypatch, capsys):
         socket.create_connection((HOME, free))
 
 
+def test_a_page_gives_way_to_its_run(tmp_path, monkeypatch):
+    """Linux heeds a priority among the processes of a session; in a group of its own Ctrl-C leaves the page alone."""
+    made, begin = [], subprocess.Popen
+    monkeypatch.setattr(live_page.subprocess, "Popen", lambda _, **given: made.append(begin("cat", **given)) or made[0])
+    own, priority = os.getpid(), lambda process: os.getpriority(os.PRIO_PROCESS, process)
+    with live_page.page(8008, tmp_path, []):
+        page = made[0].pid
+        assert os.getsid(page) == os.getsid(own) and os.getpgid(page) == page != os.getpgid(own)
+        assert priority(page) == min(priority(own) + 10, 19)
+    assert made[0].returncode == 0
+
+
 @pytest.mark.parametrize("how", ["closed", "interrupted"])
 @pytest.mark.slow
 def test_a_page_ends_with_its_input_or_by_ctrl_c(free, how):
@@ -364,17 +380,79 @@ def test_a_page_that_is_open_has_the_last_numbers(finished_run):
         assert not waiting.is_alive()
 
 
-@pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
-def test_a_browser_shows_the_run(finished_run, server, tmp_path):
-    """Its progress, the curves of all splits, and a row with the latest return of each task."""
+def shown_by_chromium(server, folder):
+    """The page's elements, as a browser has them a while after it was opened."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next(filter(None, map(shutil.which, names)), None) or pytest.skip("needs chromium")
     quiet = "gpu quic background-networking component-update sync".split()
     words = ["--headless", "--no-sandbox", "--no-first-run", *(f"--disable-{name}" for name in quiet), "--dump-dom"]
-    words += [f"--user-data-dir={tmp_path}", "--timeout=20000", "--virtual-time-budget=5000"]
+    words += [f"--user-data-dir={folder}", "--timeout=20000", "--virtual-time-budget=5000"]
     page = f"http://{HOME}:{server.server_port}/"
-    shown = subprocess.run(["chromium", *words, page], capture_output=True, text=True, stdin=subprocess.DEVNULL).stdout
+    return subprocess.run([browser, *words, page], capture_output=True, text=True, stdin=subprocess.DEVNULL).stdout
+
+
+ELEMENTS = """
+class Element {
+  constructor(name) { Object.assign(this, { name, children: [], style: {} }); }
+  append(...children) { this.children.push(...children); }
+  replaceChildren(...children) { this.children = children; }
+  querySelector(name) {
+    if (!this.children.length) this.append(new Element(name));
+    return this.children[0];
+  }
+  setAttribute() {}
+  get firstElementChild() { return this.querySelector("div"); }
+  get rows() { return this.children; }
+  get cells() { return this.children; }
+  get options() { return this.children; }
+  set textContent(text) { this.children = [text]; }
+  toString() { return `<${this.name}>${this.children.join("")}</${this.name}>`; }
+}
+const made = {}, address = process.argv[1], timers = [], asked = fetch;
+globalThis.document = {
+  getElementById: (id) => made[id] ??= new Element("div"),
+  createElement: (name) => new Element(name),
+  createElementNS: (_, name) => new Element(name),
+  addEventListener() {},
+};
+globalThis.Option = class extends Element { constructor(text) { super("option"); this.textContent = text; } };
+globalThis.fetch = (path) => asked(address + path);
+globalThis.setTimeout = (then) => timers.push(then);
+"""
+
+
+def shown_by_node(server, then=""):
+    """The page's elements, as its script makes them of the run's numbers in a document that has no more than it needs.
+
+    Code that comes ``then`` runs after the page has asked once.
+    """
+    node = shutil.which("node") or pytest.skip("needs node")
+    page = server.page.decode()
+    script = page[page.index("<script>") + len("<script>") : page.index("</script>")]
+    wait = f"(async () => {{ while (!run) await new Promise(setImmediate); {then}"
+    words = [node, "-e", f"{ELEMENTS}{script}{wait}; console.log(Object.values(made).join('')); }})();"]
+    done = subprocess.run([*words, f"http://{HOME}:{server.server_port}/"], capture_output=True, text=True, timeout=60)
+    return done.stdout or pytest.fail(done.stderr)
+
+
+@pytest.mark.parametrize("by", ["chromium", "node"])
+def test_the_page_shows_the_run(server, tmp_path, by):
+    """Its progress, the curves of all splits, and a row with the latest return of each task."""
+    shown = shown_by_chromium(server, tmp_path) if by == "chromium" else shown_by_node(server)
     told = json.loads(server.numbers())
     assert "600 of 600 steps (100%) · means over 2 seeds" in shown and "· done</div>" in shown
     assert all(f"{split}, evaluated: " in shown for split in told["scores"]["return"]) and "while it trains: " in shown
     found = re.findall(r"<tr.*?<button>(.*?)</button>.*?<td>([\d.]*)</td><td>([\d.]+)</td></tr>", shown)
     assert [name for name, _, _ in found] == [f"{task['called']} {task['label']}" for task in told["tasks"]]
     np.testing.assert_allclose([float(x) for *_, x in found], [task["scored"] for task in told["tasks"]], rtol=0.05)
+
+
+def test_a_chosen_task_has_its_own_curve(server):
+    """Of training where it was trained, else of evaluations; and its latest value is that of its row."""
+    tasks = json.loads(server.numbers())["tasks"]
+    for i, how in ((1, "while it trains"), (len(tasks) - 1, "evaluated")):
+        shown = shown_by_node(server, then=f"$('list').children[0].rows[{i}].cells[0].children[0].onclick()")
+        task = tasks[i]
+        value = re.search(rf"{task['called']} {task['label']}, {how}: ([\d.]+)", shown)
+        assert value and float(value[1]) == pytest.approx(task["curve"][-1], rel=0.05)
+        assert f"of {task['called']} {task['label']}</div>" in shown

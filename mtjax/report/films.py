@@ -143,32 +143,37 @@ def moving(
     played: Recording,
     by_name: Mapping[str, Any],
     named: Mapping[str, str],
+    shadows: bool = True,
 ) -> Iterator[tuple[float, Callable[[float], np.ndarray]]]:
     """Give the seconds until the last of the chosen tasks' episodes ends, and a function that draws all at a time [s].
 
     The episodes of a trial move side by side.
 
     It draws one frame (height, width, 3), with captions. Only the thread that opens it may draw.
+
+    Args:
+        shadows: whether worlds of MuJoCo have them, which without a GPU are most of the work.
     """
     chosen, columns = _episodes(chosen, played)
     width = _width(len(chosen), _LIVE_WIDTHS)
     captions = [_caption(env, one, played, named) for one in chosen]
     with contextlib.ExitStack() as opened:
-        tiles = [opened.enter_context(_drawing(env, one, played, by_name[one.part.name], width)) for one in chosen]
+        open_tile = lambda one: _drawing(env, one, played, by_name[one.part.name], width, shadows)
+        tiles = [opened.enter_context(open_tile(one)) for one in chosen]
         draw = lambda time: grid(captioned([tile(time)[None] for tile in tiles], captions), columns)[0]
         yield max(span_of(played.lengths[one.place], one.episode)[1] / _steps_per_second(one) for one in chosen), draw
 
 
 @contextlib.contextmanager
 def _drawing(
-    env: FamilyOrMixture, one: Chosen, played: Recording, states: Any, width: int
+    env: FamilyOrMixture, one: Chosen, played: Recording, states: Any, width: int, shadows: bool
 ) -> Iterator[Callable[[float], np.ndarray]]:
     """Give a function that draws one task at a time [s]; the last frame stays after the episode's end."""
     family: Any = one.part.family
     row, (first, length) = env.own_row(int(played.rows[one.place])), span_of(played.lengths[one.place], one.episode)
     shown, size = jax.tree.map(lambda x: x[one.own][first : first + length], states), (width, width * 3 // 4)
     kept = lambda i: family.pictures(jax.tree.map(lambda x: x[i : i + 1], shown), *size)[0]
-    opened = render.drawing(family, row, shown, *size) if isinstance(family, Pictured) else nullcontext(kept)
+    opened = render.drawing(family, row, shown, *size, shadows) if isinstance(family, Pictured) else nullcontext(kept)
     with opened as draw:
         of_step = lru_cache(1)(draw)
         yield lambda time: of_step(min(int(time * _steps_per_second(one)), length - 1))

@@ -81,7 +81,8 @@ class Watched(NamedTuple):
         Curves are means over the run's seeds, and evaluations over their episodes too.
         """
         self.metrics.update()
-        curves, evaluations = self.metrics.means(_POINTS), self._evaluations()
+        curves, of_tasks = self.metrics.means(_POINTS), self.metrics.means(_POINTS_OF_TASK)
+        evaluations = self._evaluations()
         scores = {} if evaluations is None else {"return": evaluations.returns, **evaluations.metrics}
         means = lambda of_splits: {split: _mean(x, (0, 2, 3)) for split, x in of_splits.items()}
         return _plain(
@@ -92,21 +93,26 @@ class Watched(NamedTuple):
                 "curves": {name: x for name, x in curves.items() if name == "steps" or _is_whole_runs(name)},
                 "evaluated": [] if evaluations is None else evaluations.steps,
                 "scores": {name: means(x) for name, x in scores.items()},
-                "tasks": self._tasks(evaluations),
+                "task_steps": of_tasks.get("steps", []),
+                "tasks": self._tasks(evaluations, of_tasks),
             }
         )
 
     def _progress(self) -> dict[str, Any]:
-        """Return the steps made and planned, the seconds gone and left, and whether a process runs."""
+        """Return the steps made and planned, those of all seeds a second, the seconds gone and left, and if it runs."""
         rows, total = self.metrics.rows[-_RECENT * self.config.members :], self.config.length * self.config.worlds
         found: dict[str, Any] = {"seeds": self.config.members, "total": total, "running": lock.is_held(self.directory)}
         if not rows:
-            return found | {"steps": 0, "seconds": None, "left": None, "silent": None}
-        steps, clock = (self.metrics.names.index(name) for name in ("steps", "wall_seconds"))
-        rate = (rows[-1][steps] - rows[0][steps]) / max(rows[-1][clock] - rows[0][clock], 1e-9)
-        left = max(total - rows[-1][steps], 0) / rate if rate > 0 else None
-        silent = time.time() - self.metrics.path.stat().st_mtime
-        return found | {"steps": rows[-1][steps], "seconds": rows[-1][clock], "left": left, "silent": silent}
+            return found | {"steps": 0, "rate": None, "seconds": None, "left": None, "silent": None}
+        columns = [self.metrics.names.index(name) for name in ("steps", "seconds", "wall_seconds")]
+        (steps, _, clock), (made, trained, waited) = rows[-1][columns], rows[-1][columns] - rows[0][columns]
+        times = {
+            "rate": self.config.members * made / trained if min(made, trained) > 0 else None,  # as the console has it
+            "seconds": clock,
+            "left": max(total - steps, 0) * waited / made if made > 0 else None,
+            "silent": time.time() - self.metrics.path.stat().st_mtime,
+        }
+        return found | {"steps": steps, **times}
 
     def _evaluations(self) -> Evaluations | None:
         """Return the run's evaluations; None if there are none yet, or their file cannot be read."""
@@ -115,10 +121,16 @@ class Watched(NamedTuple):
             return _read_evaluations(file, file.stat().st_mtime_ns)
         return None
 
-    def _tasks(self, evaluations: Evaluations | None) -> list[dict[str, Any]]:
-        """Return every task with its split, number and name; those of the run also with a curve and latest returns."""
+    def _tasks(self, evaluations: Evaluations | None, curves: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+        """Return every task with its split, number and name; those of the run also with a curve and latest returns.
+
+        The curve is of ``task_steps`` where something was trained, else of ``evaluated``.
+
+        Args:
+            curves: what metrics.csv has, by column.
+        """
         own, found = self.env is self.config.family, []
-        curves = self.metrics.means(_POINTS_OF_TASK) if own else {}
+        curves = curves if own else {}
         scores = evaluations.returns if own and evaluations is not None else {}
         for split in SPLITS:
             scored = (

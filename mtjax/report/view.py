@@ -36,7 +36,7 @@ from mtjax.saved.config_json import from_json
 from mtjax.saved.policy import Policy, load
 from mtjax.types import Task
 
-_FPS, _LONGEST = 25, 30.0  # pictures a second, and seconds after which worlds move by a newer policy
+_FPS, _LONGEST = 25, 30.0  # pictures a second at most, and seconds after which worlds move by a newer policy
 _MOST = 9  # tasks beside each other
 _WAIT = 2.0  # seconds until what failed is tried again
 _PATIENCE = 4.0  # seconds in which a page that is open asks again
@@ -124,11 +124,13 @@ class Worlds:
             playing, played = self.playing(newest), self.played(newest, episode)
         env, named = playing.policy.env, playing.named
         chosen = [films.choose_one(env, split, number)] if split else films.choose(env, SPLITS[:1], ())[:_MOST]
-        with films.moving(env, chosen, *played, named) as (seconds, draw):
+        with films.moving(env, chosen, *played, named, shadows=False) as (seconds, draw):
             begun = time.monotonic()
             while (now := time.monotonic() - begun) < min(seconds, _LONGEST) and not self.ended.is_set():
-                yield _jpeg(draw(now))
-                time.sleep(max(begun + now + 1 / _FPS - time.monotonic(), 0))
+                picture = _jpeg(draw(now))
+                took = time.monotonic() - begun - now
+                yield picture
+                time.sleep(max(1 / _FPS - took, took))  # drawing takes half a core at most
 
     def _newest(self) -> str:
         """Return the name of the newest checkpoint; empty for a policy without any."""
