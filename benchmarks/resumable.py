@@ -11,7 +11,7 @@ from mtjax.saved.result import Result
 from mtjax.types import Agent, Env
 
 
-def train(folder: Path, family: Env, agent: Agent, seconds: float = math.inf, **given: Any) -> Result:
+def train(folder: Path, family: Env | str, agent: Agent | str, seconds: float = math.inf, **given: Any) -> Result:
     """Train by ``mtjax.train`` in a folder, or go on with the run that was stopped there.
 
     Checkpoints are written after evaluations and after a signal. The disk needs room for three training states, replay
