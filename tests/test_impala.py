@@ -84,7 +84,8 @@ def test_the_policy_that_acts_lags_behind():
 def test_probes_are_learned(kind, lag):
     """Values of every task, and the best action where there is one; also from older policies."""
     given = {"num_envs": 16, "chunk_steps": 3200, "unroll": 8, "minibatches": 2, "epochs": 2, "gamma": 0.9}
-    given |= {"actor_lr": 3e-3, "critic_lr": 1e-2, "entropy_cost": 0.0, "actor_lag": lag}
+    # At a rate of 3e-3 one seed in six ends at its bounds if what acts lags, and rounding decides which.
+    given |= {"actor_lr": 1e-3, "critic_lr": 1e-2, "entropy_cost": 0.0, "actor_lag": lag}
     updates = given["chunk_steps"] // given["unroll"] * given["epochs"] * given["minibatches"]
     agent, tasks = tiny("impala", lr_schedule="linear", lr_updates=updates), tasks_of(kind, SCALES)
     state, history = train(Probe(), agent, given, tasks=tasks)
