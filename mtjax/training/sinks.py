@@ -96,9 +96,9 @@ def trackio_runs(project: str, directory: Path, config: Mapping[str, Any]) -> Se
 
     def begin(run: str) -> Any:
         settings = {"resume": "allow", "embed": False, "auto_log_gpu": False, "auto_log_cpu": False}
-        told = {**config, "run": run}
-        begin = partial(module.init, project, f"{directory.name}-{run}", directory.name, config=told, **settings)
-        return contextvars.Context().run(begin)  # as one context has one run, and ends it when another begins
+        settings |= {"group": directory.name, "config": {**config, "run": run}}
+        opened = contextvars.Context()  # of its own, as one context has one run, and ends it when another begins
+        return opened.run(partial(module.init, project, f"{directory.name}-{run}", **settings))
 
     return SeedRuns(begin)
 
