@@ -281,17 +281,20 @@ def test_an_actor_learns_from_pictures_under_critics_that_see_the_state():
 
 
 ON_POLICY = dict(hidden=(32, 32), latent_widths=(16,), num_envs=16, unroll=4, minibatches=2, chunk_steps=40)
-ON_POLICY |= dict(actor_lr=1.5e-3, critic_lr=1.5e-3, entropy_cost=0.0)  # twice as fast it unlearns at times
+ON_POLICY |= dict(actor_lr=1.5e-3, critic_lr=1.5e-3, entropy_cost=0.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("representation", ["encoded", "asymmetric"])
 def test_ppo_learns_what_only_pictures_show(representation):
-    """Without seeing, the best mean return is -0.625."""
+    """Without seeing, the best mean return is -0.625.
+
+    One seed alone can be in a chunk in which it has unlearned: critics go on moving the encoder below the actor.
+    """
     env = Pictured("by-both") if representation == "encoded" else BESIDE
     agent = mtjax.agent("ppo", representation=representation)
-    state, history = probes.train(env, agent, ON_POLICY, chunks=6)
-    assert np.mean(history[-1]["return"]) > -0.3
+    state, history = probes.train(env, agent, ON_POLICY, seeds=range(4), chunks=4)
+    assert np.mean([metrics["return"] for metrics in history[-2:]]) > -0.3
     nets = state.agent.nets
     assert ("latent" in nets["representation"].shared) == (representation == "encoded")
     assert "sight" in nets["actor"].shared
