@@ -119,8 +119,12 @@ def test_a_policy_of_the_package_has_no_checkpoints_to_choose_from():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", pretrained.names())
 def test_a_policy_scores_what_its_page_says(name):
-    """The return on training tasks in the table, within what two other episodes of each task may differ."""
+    """The return on training tasks in the table, within what two other episodes of each task may differ.
+
+    A car that leaves its track loses nearly all, and steps of cars and boats cost nothing: they have twenty.
+    """
     told = re.search(rf"^\| `{name}` \|.*?\| (\d+) \|", PAGE.read_text(), re.MULTILINE)
     assert told, f"{PAGE.name} has no row of {name}"
-    found = score(mtjax.load(name), 2)["train"].returns.mean()
+    episodes = 20 if name.startswith(("racing", "sailing")) else 2
+    found = score(mtjax.load(name), episodes)["train"].returns.mean()
     assert abs(found - float(told[1])) < 0.05 * float(told[1]), found
