@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import needs
 from probes import family_for, tiny
 from test_export import ENV, observations, policy_of
 
@@ -23,6 +24,7 @@ from mtjax.training import finetune
 from mtjax.types import InputError
 
 PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
+NEEDED = {"mt10/brc": [needs("metaworld")]}
 
 
 @pytest.mark.slow
@@ -117,7 +119,7 @@ def test_a_policy_of_the_package_has_no_checkpoints_to_choose_from():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", pretrained.names())
+@pytest.mark.parametrize("name", [pytest.param(name, marks=NEEDED.get(name, ())) for name in pretrained.names()])
 def test_a_policy_scores_what_its_page_says(name):
     """The return on training tasks in the table, within what two other episodes of each task may differ.
 
