@@ -47,7 +47,7 @@ def physics(env: Any, worlds_per_task: int, steps: int, resets: bool) -> Any:
         worlds, env_step = step_envs(env, agent, learners, tasks, worlds, world_keys(act_keys, shape))
         if resets:
             fresh_keys = partial(world_keys, reset_keys, shape)
-            worlds = reset_ended(env, agent, learners, tasks, worlds, env_step.ends, fresh_keys)
+            worlds, _ = reset_ended(env, agent, learners, tasks, worlds, env_step.ends, fresh_keys)
         seen = jnp.sum(env_step.transition.reward) + jnp.sum(env_step.transition.next_obs)
         return (worlds, keys), seen
 

@@ -92,6 +92,26 @@ class Lost(Walk):
 
 
 @dataclasses.dataclass(frozen=True)
+class Unsound(Walk):
+    """A walk that begins with no number from starts below a share, in tasks with a negative scale; then it has one."""
+
+    share: float = 0.3
+    early: bool = True
+
+    @property
+    def ends_early(self):
+        return self.early
+
+    def start(self, task, key):
+        obs = super().start(task, key)
+        return jnp.where((task.goal["scale"] < 0) & (obs < self.share), jnp.nan, obs)
+
+    def rules(self, task, state, action):
+        obs = jnp.nan_to_num(state.obs[0])
+        return 1.0, obs + 1, False
+
+
+@dataclasses.dataclass(frozen=True)
 class Goals(Walk):
     """Walks whose reward is the task's scale times the observation; of goals that the key draws, plus its bits."""
 

@@ -126,7 +126,7 @@ def play(family, steps, num_envs=3):
     def step(worlds, key):
         worlds, env_step = rollout.step_envs(family, agent, learners, tasks, worlds, keys(key))
         fresh = lambda: keys(jax.random.fold_in(key, 1))
-        begun = rollout.reset_ended(family, agent, learners, tasks, worlds, env_step.ends, fresh)
+        begun, _ = rollout.reset_ended(family, agent, learners, tasks, worlds, env_step.ends, fresh)
         return begun, (env_step.transition, env_step.ends.terminal, worlds.state)
 
     @jax.jit

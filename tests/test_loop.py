@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Broken, Lost, Probe, Stub, Walk, tasks_of, tiny, train
+from probes import Broken, Lost, Probe, Stub, Unsound, Walk, tasks_of, tiny, train
 
 import mtjax
 from mtjax.config import configure
@@ -241,6 +241,18 @@ def test_one_lost_world_stops_no_run_however_short_its_chunks():
     _, (metrics,) = train(Lost(share=0.1), Recorder(), {**SETTINGS, "stagger": False})
     np.testing.assert_array_equal(metrics["lost"], [[0, 1]])
     np.testing.assert_array_equal(metrics["bad_step"], [[-1, -1]])
+
+
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize("share", [0.05, 1.0])
+def test_an_episode_that_begins_with_no_number_is_a_bad_step(share, early):
+    """The step before it, of its task alone, or the first of the chunk. No world is lost: the next step has numbers."""
+    state, (metrics,) = train(Unsound(share=share, early=early), Recorder(), {**SETTINGS, "stagger": False})
+    begun = np.isnan(np.asarray(state.data.ring.rows.obs)[0, 1, :CHUNK, :, 0])  # (H, E)
+    first = np.flatnonzero(begun.any(axis=1))[0]
+    assert (first > 0) == (share < 1)
+    np.testing.assert_array_equal(metrics["bad_step"], [[-1, max(first - 1, 0)]])
+    np.testing.assert_array_equal(metrics["lost"], 0)
 
 
 # With an agent that learns.

@@ -62,7 +62,7 @@ def reset(cls, ended, seed=1, shift="1,2,3", **settings):
 
     def begin(worlds, ended, keys):
         ends, keys = EACH_EPISODE.ends(ended, ended, ended, None), partial(rollout.world_keys, keys, ended.shape)
-        return rollout.reset_ended(env, agent, learners, tasks, worlds, ends, keys)
+        return rollout.reset_ended(env, agent, learners, tasks, worlds, ends, keys)[0]
 
     run = jax.jit(begin)
     Fall.counted.clear()

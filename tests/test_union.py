@@ -245,7 +245,7 @@ def test_episodes_begin_anew_in_the_union_as_in_joined_scenes(steps=4, worlds=3)
                 act, reset = keys[:, 0], keys[:, 1]
                 held, seen = rollout.step_envs(env, agent, learners, tasks, held, rollout.world_keys(act, shape))
                 keys = partial(rollout.world_keys, reset, shape)
-                begun = rollout.reset_ended(env, agent, learners, tasks, held, seen.ends, keys)
+                begun, _ = rollout.reset_ended(env, agent, learners, tasks, held, seen.ends, keys)
                 return begun, (seen, held.state)
 
             return jax.lax.scan(step, held._replace(age=ages), jax.random.split(jax.random.key(1), (steps, 1, 2)))[1]

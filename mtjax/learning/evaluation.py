@@ -239,7 +239,8 @@ def adapted(
         act_keys, reset_keys = split_keys(keys, 2)
         worlds, env_step = step_envs(env, agent, learners, tasks, worlds, world_keys(act_keys, shape))
         fresh = partial(world_keys, reset_keys, shape)
-        return (learners, reset_ended(env, agent, learners, tasks, worlds, env_step.ends, fresh)), env_step.transition
+        worlds, _ = reset_ended(env, agent, learners, tasks, worlds, env_step.ends, fresh)
+        return (learners, worlds), env_step.transition
 
     def update(learners: Any, keys: Key) -> tuple[Any, None]:
         reset_keys, *step_keys = split_keys(keys, length + 1)
@@ -309,7 +310,7 @@ def _go_on(
     if trials.episodes == 1:
         return worlds
     ends = jax.tree.map(lambda x: x & alive, env_step.ends)
-    return reset_ended(env, agent, learners, tasks, worlds, ends, keys, trials)
+    return reset_ended(env, agent, learners, tasks, worlds, ends, keys, trials)[0]
 
 
 class Recording(NamedTuple):

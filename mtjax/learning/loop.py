@@ -191,6 +191,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         environment's (S, T), as means over these episodes' last steps; the agent's, as means (S, T) or (S,) over the
         chunk; "lost" (S, T), how often a world was lost (``step_envs``), whose episode does not count; "bad_step"
         (S, T), the first step whose numbers were not finite, or -1; "bad_reward" (S, T) that whose reward was not.
+        An episode's first observation counts to the step before it, or to the first of the chunk.
         Worlds that are lost more than once, and at more than one in 10,000 steps of a task, count as numbers that are
         not finite.
     """
@@ -198,6 +199,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     if settings.plays.steps:
         state = _take_turns(env, agent, settings, known, state)
         tasks = rows_of(known, state.rows)
+    sound = jnp.all(bounded_worlds(state.worlds.obs), axis=2)
 
     def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
@@ -213,6 +215,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
     count = settings.num_envs * settings.chunk_steps
+    history["finite"] = history["finite"].at[0, 0].min(sound)
     metrics = _summarise(history, count)
     if state.heard is not None:
         returns = collectives.of_all_seeds(metrics["return"])
@@ -383,8 +386,8 @@ def _step(env, agent, settings: Settings, tasks, state: TrainState, keys: Key, r
     transition, total = env_step.transition, state.total + env_step.transition.reward
     ended = transition.ended
     fresh_keys = partial(world_keys, reset_keys, shape)
-    begun = reset_ended(env, agent, state.agent, tasks, worlds, env_step.ends, fresh_keys, trials)
-    seen = _reduce_step(env_step, total, state.counted)
+    begun, sound = reset_ended(env, agent, state.agent, tasks, worlds, env_step.ends, fresh_keys, trials)
+    seen = _reduce_step(env_step, sound, total, state.counted)
     state = state._replace(
         worlds=begun,
         total=jnp.where(ended, 0.0, total),
@@ -451,8 +454,12 @@ def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Ke
     return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, learners)
 
 
-def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, Any]:
-    """Reduce a step to the statistics for metrics, leaves (S, T)."""
+def _reduce_step(env_step: EnvStep, sound: Array, total: Array, counted: Array) -> dict[str, Any]:
+    """Reduce a step to the statistics for metrics, leaves (S, T).
+
+    Args:
+        sound: (S, T, E) where no episode began with numbers out of bounds; others of that kind are lost.
+    """
     transition = env_step.transition
     finished = transition.ended & counted & ~env_step.lost
     over_envs = lambda x: jnp.sum(jnp.where(finished, x, 0.0), axis=2)  # what is not finished may not be finite
@@ -460,7 +467,7 @@ def _reduce_step(env_step: EnvStep, total: Array, counted: Array) -> dict[str, A
         "finished": jnp.sum(finished, axis=2),
         "lost": jnp.sum(env_step.lost, axis=2),
         "total": over_envs(total),
-        "finite": jnp.all(bounded_worlds(transition.next_obs) & jnp.isfinite(transition.reward), axis=2),
+        "finite": jnp.all(sound & jnp.isfinite(transition.reward), axis=2),
         "rewarded": jnp.all(jnp.isfinite(transition.reward), axis=2),
         "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
     }

@@ -217,7 +217,7 @@ def reset_ended(
     ends: Ends,
     keys: Callable[[], Key],
     trials: Trials = EACH_EPISODE,
-) -> Worlds:
+) -> tuple[Worlds, Array]:
     """Begin new episodes, and new trials, where they have ended; a branch skips this if no episode has.
 
     Every episode starts in a state of its own, drawn with its world's own key. If episodes end early, at any step, only
@@ -227,6 +227,9 @@ def reset_ended(
     Args:
         ends: what has ended with the step before, leaves (S, T, E).
         keys: a function that returns keys (S, T, E); only the branch calls it.
+
+    Returns:
+        the worlds, and (S, T, E) bool, which is false where an episode begins with numbers out of bounds.
     """
     own = type(env).renew_worlds is not renew_worlds  # as it steps all of its worlds at once
     few = not own and env.ends_early and env.episode_length > 1
@@ -234,14 +237,14 @@ def reset_ended(
     if trials.keeps_state:
         begin = partial(_change_tasks, cast(Lasting, env))
 
-    def renew(worlds: Worlds) -> Worlds:
-        begun = begin(tasks, worlds, ends, keys(), trials)
+    def renew(worlds: Worlds) -> tuple[Worlds, Array]:
+        begun, sound = begin(tasks, worlds, ends, keys(), trials)
         age = jnp.where(ends.episode, 0, worlds.age)
         memory = where_worlds(ends.trial, begin_memory(agent, learners, tasks, age), worlds.memory)
         episode = None if worlds.episode is None else jnp.where(ends.trial, 0, worlds.episode + ends.episode)
-        return Worlds(*begun, memory, age, episode)
+        return Worlds(*begun, memory, age, episode), sound
 
-    return jax.lax.cond(jnp.any(ends.episode), renew, lambda worlds: worlds, worlds)
+    return jax.lax.cond(jnp.any(ends.episode), renew, lambda worlds: (worlds, jnp.ones(worlds.age.shape, bool)), worlds)
 
 
 def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:
@@ -255,39 +258,39 @@ def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:
     return transition._replace(next_obs=where_worlds(inside, worlds.obs, transition.next_obs))
 
 
-def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
-    """Reset all worlds with keys (S, T, E), and return those that have ended reset, and the others as they are."""
+# Each of three ways to begin anew returns all worlds, of which those that have not ended are as they were. It returns
+# (S, T, E) bool too, which is false where a first observation is out of bounds.
+
+
+def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> tuple[_Begun, Array]:
+    """Reset all worlds with keys (S, T, E), and take those that have ended."""
     lasting = lambda drawn: where_worlds(ends.trial, drawn, worlds.task)
     drawn = lasting if trials.episodes > 1 else lambda drawn: drawn
     start = _begin(env, tasks, keys, drawn, (ends.world, worlds.state))
-    return _Begun(start.state, *where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs)))
+    begun = _Begun(start.state, *where_worlds(ends.episode, (start.task, start.obs), (worlds.task, worlds.obs)))
+    return begun, ~ends.episode | bounded_worlds(start.obs)
 
 
-def _change_tasks(env: Lasting, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
-    """Choose tasks with keys (S, T, E) for worlds whose trials have ended, which go on where they are; reset lost ones.
-
-    Returns:
-        these worlds, and the others as they are.
-    """
+def _change_tasks(
+    env: Lasting, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials
+) -> tuple[_Begun, Array]:
+    """Choose tasks with keys (S, T, E) where trials have ended, whose worlds go on as they are; reset lost ones."""
     lost, own = ends.world, _Begun(worlds.state, worlds.task, worlds.obs)
     again = lambda: _reset_all(env, tasks, worlds, Ends(lost, lost, lost, lost, lost), keys, trials)
-    begun = jax.lax.cond(jnp.any(lost), again, lambda: own)
+    begun, sound = jax.lax.cond(jnp.any(lost), again, lambda: (own, jnp.ones(lost.shape, bool)))
     if tasks.draws is None:
-        return begun
+        return begun, sound
     of_task = jax.vmap(partial(trials.plays.follow, env), (None, 0, 0, 0))  # type: ignore
     follow = jax.vmap(jax.vmap(of_task), (None, 0, 0, 0))
     following = follow(tasks, worlds.task, begun.state, keys)  # type: ignore
     goes_on = ends.trial & ~lost
     seen = frames.begin(env.observe_worlds(following, begun.state), env.spec.frames)
-    return _Begun(begun.state, *where_worlds(goes_on, (following, seen), (begun.task, begun.obs)))
+    begun = _Begun(begun.state, *where_worlds(goes_on, (following, seen), (begun.task, begun.obs)))
+    return begun, sound & (~goes_on | bounded_worlds(seen))
 
 
-def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> _Begun:
-    """Reset worlds that have ended with keys (S, T, E), in batches of at most one in ``_SHARES`` of all worlds.
-
-    Returns:
-        these worlds reset, and the others as they are.
-    """
+def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> tuple[_Begun, Array]:
+    """Reset worlds that have ended with keys (S, T, E), in batches of at most one in ``_SHARES`` of all worlds."""
     ended = ends.episode
     _, num_tasks, num_envs = ended.shape
     count, size = ended.size, -(-ended.size // _SHARES)
@@ -305,17 +308,19 @@ def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, tr
         choose = lambda new, old: jnp.where(closed[chosen].reshape(-1, *[1] * (new.ndim - 1)), new, old[chosen])
         return jax.tree.map(choose, drawn, old), keys
 
-    def reset(carry: tuple[Array, _Begun]) -> tuple[Array, _Begun]:
-        left, old = carry
+    def reset(carry: tuple[Array, tuple[_Begun, Array]]) -> tuple[Array, tuple[_Begun, Array]]:
+        left, (old, sound) = carry
         chosen = jnp.nonzero(left, size=size, fill_value=count)[0]  # what is beyond the last world is dropped again
         each, own_keys = tasks_of(chosen, old.task, flat_keys)
         start = env.reset_worlds(*jax.tree.map(lambda x: x[None, None], (each, own_keys)))
         state, obs = jax.tree.map(lambda x: x[0, 0], (start.state, frames.begin(start.obs, env.spec.frames)))
         put = lambda x, y: x.at[chosen].set(y, mode="drop")
         new = _Begun(state, None if tasks.draws is None else each, obs)
-        return left.at[chosen].set(False, mode="drop"), jax.tree.map(put, old, new)
+        anew = jax.tree.map(put, (old, sound), (new, bounded_worlds(start.obs)[0, 0]))
+        return left.at[chosen].set(False, mode="drop"), anew
 
     old = _Begun(worlds.state, worlds.task, worlds.obs)
     flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[3:]), old)
-    _, new = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), reset, (ended.reshape(count), flat))
+    first = ended.reshape(count), (flat, jnp.ones(count, bool))
+    _, new = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), reset, first)
     return jax.tree.map(lambda x: x.reshape(*ended.shape, *x.shape[1:]), new)
