@@ -21,7 +21,7 @@ from PIL import Image
 import mtjax
 from mtjax.envs import name_of
 from mtjax.envs.mixtures import apart
-from mtjax.envs.pixels import Pictured
+from mtjax.envs.pixels import Drawable
 from mtjax.learning.evaluation import record
 from mtjax.report import render
 from mtjax.saved import pretrained
@@ -42,8 +42,8 @@ def draw(name: str) -> None:
             save(name_of(family), frames)
     elif name.startswith("metaworld-") or (FOLDER / f"{name}.webp").exists():
         return
-    elif isinstance(mtjax.make(name), Pictured):
-        save(name, [start(name)])
+    elif isinstance(env := mtjax.make(name), Drawable) and env.films:
+        save(name, [start(env)])
 
 
 def save(name: str, frames: list[Image.Image]) -> None:
@@ -79,9 +79,8 @@ def frames_from(family: Any, rows: Sequence[int], states: Any, first: int) -> np
     return np.concatenate([render.film(family, row, each(seen, i), *SIZE) for i, row in enumerate(rows)], axis=2)
 
 
-def start(name: str) -> Image.Image:
+def start(env: Any) -> Image.Image:
     """Return a picture of tasks at their start."""
-    env = mtjax.make(name)
     tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
     states = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), len(tasks.row))).state
     stills = [render.film(env, int(row), each(states, slice(i, i + 1)), *SIZE)[0] for i, row in enumerate(tasks.row)]

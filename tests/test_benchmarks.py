@@ -828,6 +828,18 @@ def test_scores_of_scales_are_beside_their_controls(script, tmp_path):
     assert cells[1][4].split()[0] == f"{alone[:, :, 1].mean():.1f}"
 
 
+def test_ways_of_hindsight_are_compared_in_pairs_of_seeds(script, tmp_path):
+    """Areas less those of the same seeds without hindsight, and with uniform choice; nothing beside other seeds."""
+    none = np.random.default_rng(0).uniform(size=(4, 5))  # (S, V)
+    found = {"none": none, "uniform": none[:2] + 1, "inverse": none + 3}
+    for way, returns in found.items():
+        (tmp_path / f"{way}.json").write_text(json.dumps({"returns": returns.tolist(), "training_seconds": 7}))
+    cells = [line.strip("| ").split(" | ") for line in script("hindsight").table(tmp_path).splitlines()[2:]]
+    assert [line[0] for line in cells] == ["`none`", "`uniform`", "`inverse`"]
+    assert [[x.split()[0] for x in line[3:5]] for line in cells] == [["-", "-"], ["-", "-"], ["+3.0", "-"]]
+    assert (tmp_path / "table.md").read_text().startswith("| way |")
+
+
 def test_halving_is_compared_on_the_same_trials(script):
     """The rank of what it found among all that went to the end, one that diverged among them; or a refusal."""
     trial = lambda lr, *returns: {"values": {"lr": lr}, "returns": dict(zip("abc", returns, strict=False))}

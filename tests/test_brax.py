@@ -17,6 +17,8 @@ from needs import require
 import mtjax.envs.brax as adapter
 from mtjax.envs.brax import BACKENDS, NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
 from mtjax.envs.parameters import FRICTION, GRAVITY, MASS
+from mtjax.gym import FamilyEnv
+from mtjax.report import films, render
 from mtjax.types import InputError
 
 require("brax")
@@ -253,6 +255,48 @@ def test_every_environment_traces(name):
     same = jax.tree.map(lambda a, b: (a.shape, a.dtype) == (b.shape, b.dtype), start, step)
     assert all(jax.tree.leaves(same)) and not any(x.weak_type for x in jax.tree.leaves((start, step)))
     assert env.episode_length == 1000
+
+
+# Of the environments, and of the backends of one; fast has nothing to see.
+SEEN = [("inverted_pendulum", backend) for backend in BACKENDS]
+SEEN += [(name, "generalized") for name in NAMES if name not in ("fast", "inverted_pendulum")]
+_QUICK = ("inverted_pendulum", "generalized")
+
+
+@pytest.mark.parametrize("name, backend", [pytest.param(*x, marks=[] if x == _QUICK else slow) for x in SEEN])
+def test_a_film_shows_bodies_where_brax_has_its_links(name, backend):
+    """MuJoCo puts them there, given the joints that are shown."""
+    env = Brax(environment=name, backend=backend)
+    assert env.films and env.seconds_per_step == pytest.approx(env.original.dt)
+    task, data = first(env.tasks()), mujoco.MjData(env.scene_model(0))
+    joints = data.qpos + np.random.default_rng(0).uniform(-0.1, 0.1, len(data.qpos))
+    mujoco.mj_normalizeQuat(data.model, joints)
+    state = jax.jit(env.set_physics)(task, None, joints, np.zeros(data.model.nv))
+    data.qpos[:] = env.visible(task, state).joints
+    mujoco.mj_kinematics(data.model, data)
+    links = state["x"].pos if backend == "mjx" else state.x.pos
+    np.testing.assert_allclose(data.xpos[1:], links, atol=1e-5)
+
+
+def test_what_has_nothing_to_see_is_not_filmed():
+    """Neither by mtjax nor by Gymnasium."""
+    with pytest.raises(InputError, match="can be filmed"):
+        films.require(Brax(environment="fast"))
+    modes = [FamilyEnv(env).metadata["render_modes"] for env in (PENDULUM, Brax(environment="fast"))]
+    assert modes == [["rgb_array"], []]
+
+
+def test_a_film_of_a_world_without_a_camera_shows_all_of_it():
+    """Or says what to install."""
+    tasks = PENDULUM.tasks()
+    place = lambda angle: PENDULUM.set_physics(first(tasks), None, jnp.array([0.0, angle]), jnp.zeros(2))
+    states = jax.tree.map(lambda *x: jnp.stack(x), *map(place, (0.0, 0.5)))
+    try:
+        frames = render.film(PENDULUM, 0, states, 64, 48)
+    except InputError as error:
+        assert "apt install" in str(error)
+        return
+    assert frames.shape == (2, 48, 64, 3) and np.std(frames[0]) > 5 and np.any(frames[0] != frames[1])
 
 
 def test_a_family_first_used_in_a_trace_keeps_no_tracers():

@@ -548,7 +548,7 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
     [
         ("", "say which run to evaluate: --run=DIR"),
         ("--run=nowhere", "'nowhere' is not a run: there is no such folder"),
-        ("--run=brc", "unknown run or trained policy 'brc'; choose from: finger-spin-vary-size/brc"),
+        ("--run=brc", "unknown run or trained policy 'brc'; did you mean 'mt10/brc'? choose from: finger-spin-vary-s"),
         ("--run=x --env.combine=grid", "unknown flag '--env.combine'; --help lists the flags"),
         ("--run=x --env.vary", "--env.vary needs the name of a parameter"),
         ("runs/x --video", "say which run to evaluate by --run=runs/x"),

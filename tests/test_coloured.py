@@ -9,7 +9,6 @@ import pytest
 from probes import QUICK
 
 import mtjax
-from mtjax.envs.pixels import scene_model
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -123,7 +122,7 @@ def test_pictures_show_the_tasks_own_colours():
     state = env.reset(pick(env, 0), jax.random.key(0)).state
     one, other = (np.int32(draw(pick(env, row), state)) for row in (0, 1))
     assert np.any(one != other, axis=-1).mean() > 0.3
-    model = scene_model(env, 1)
+    model = env.scene_model(1)
     render._arrange(model, env.visible(pick(env, 1), state))
     colours = np.unique(model.geom_rgba[:16], axis=0)
     assert len(colours) == len(np.unique(np.floor(8 * env.table.tasks.goal["squares"][1])))

@@ -12,7 +12,6 @@ from probes import QUICK
 import mtjax
 from mtjax.envs.corridors.layouts import find_ways, make_layout
 from mtjax.envs.corridors.maze import CorridorMaze, WalkerState, metres_left
-from mtjax.envs.pixels import scene_model
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -358,7 +357,7 @@ def test_films_look_through_the_walker_s_eye_at_the_walls_of_the_task():
     """Camera and balls of MuJoCo's scene are where an episode has them; of all walls those of the task stand up."""
     env, row = CorridorMaze(vary={"layout": "0:3:4"}), 2
     task, state = jax.tree.map(lambda x: x[row], env.tasks()), at((1.25, 2.5), 0.7)
-    model = scene_model(env, row)
+    model = env.scene_model(row)
     render._arrange(model, env.visible(task, state))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

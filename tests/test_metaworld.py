@@ -18,7 +18,6 @@ from mtjax.envs.engines.base import at_rest
 from mtjax.envs.metaworld import sawyer, scene
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.envs.physics import base_model
-from mtjax.envs.pixels import scene_model
 from mtjax.names import load
 from mtjax.report import render, scoring
 from mtjax.report.tables import split_table
@@ -314,7 +313,7 @@ def test_a_grip_holds_on_warp_as_on_c(name):
 @needs("metaworld")
 def test_films_show_meshes_and_things_where_the_goal_has_them():
     env, _ = made("drawer-close")
-    physics, seen = env.models[2], scene_model(env, 2)
+    physics, seen = env.models[2], env.scene_model(2)
     assert seen.nmesh > physics.nmesh + 10 and seen.nmat > 0 and seen.ntex > 1
     names = [[model.body(i).name for i in range(model.nbody)] for model in (physics, seen)]
     assert names[0] == names[1] and np.ptp([model.body("drawer").pos[0] for model in env.models]) > 0

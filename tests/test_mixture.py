@@ -641,7 +641,7 @@ def test_a_run_is_scored_family_by_family(run, capsys):
     assert told["aim"] == ("", "") and all(told["wide-aim"])  # of the family that has it
     heads = {name: f"\n{said}".split(f"\n{name}\n")[1].splitlines()[0] for name in ("aim", "wide-aim")}
     assert "success" not in heads["aim"] and "success, at any step" in heads["wide-aim"]
-    with pytest.raises(InputError, match="only families that show pictures can be filmed"):
+    with pytest.raises(InputError, match="only families whose worlds can be drawn can be filmed"):
         mtjax.evaluate.main([f"--run={run}", "--video"])
 
 

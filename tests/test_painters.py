@@ -21,7 +21,6 @@ from mtjax.envs.painters.caster import Caster
 from mtjax.envs.painters.poses import locate
 from mtjax.envs.painters.scene import Scene, field, observed
 from mtjax.envs.painters.shapes import SHAPES as KINDS
-from mtjax.envs.pixels import scene_model
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -145,7 +144,7 @@ def test_cameras_and_lights_are_those_of_dm_control(name):
     domain, _, task = title.partition("-")
     suite = require("dm_control.suite")
     theirs = suite.load(domain, task.replace("-", "_"), {"random": 0}).physics
-    model = scene_model(mtjax.make(name, engine="c"), 0)
+    model = mtjax.make(name, engine="c").scene_model(0)
     data = mujoco.MjData(model)
     with theirs.reset_context():
         theirs.data.qpos[7 if theirs.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 0 :] += 0.1
@@ -171,7 +170,7 @@ def test_a_target_s_light_hangs_above_it():
     lamp = env.scenery.scene.model.light("target").id
     poses = env.scenery.poses(task, env.visible(task, world))
     np.testing.assert_allclose(poses.lights[lamp][0], [*world.extra, 1.5])
-    model = scene_model(env, 0)
+    model = env.scene_model(0)
     render._place(model, env.marks(task, world))
     np.testing.assert_allclose(model.light_pos[lamp], [*world.extra, 1.5])
 

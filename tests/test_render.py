@@ -10,7 +10,6 @@ from PIL import Image
 
 from mtjax.envs.dm_control.finger import FingerSpin, FingerTurn
 from mtjax.envs.engines.base import World
-from mtjax.envs.pixels import scene_model
 from mtjax.report import render
 from mtjax.types import InputError
 
@@ -63,14 +62,14 @@ def test_backend_that_the_user_chose_is_kept(monkeypatch):
 
 
 def test_the_camera_does_not_depend_on_the_row():
-    models = [scene_model(FINGER, row) for row in range(2)]
+    models = [FINGER.scene_model(row) for row in range(2)]
     np.testing.assert_array_equal(models[0].cam_pos, models[1].cam_pos)
     assert [model.nlight for model in models] == [1, 1]
 
 
 def test_film_puts_targets_where_the_episode_has_them():
     family = FingerTurn()
-    model, place = scene_model(family, 0), np.array([0.1, -0.05], np.float32)
+    model, place = family.scene_model(0), np.array([0.1, -0.05], np.float32)
     task = jax.tree.map(lambda x: x[0], family.table.tasks)
     render._place(model, family.marks(task, STATES._replace(extra=place)))
     data = mujoco.MjData(model)

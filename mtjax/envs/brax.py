@@ -22,6 +22,8 @@ import numpy as np
 from mtjax.envs.engines.base import mjx_module
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter, positive
+from mtjax.envs.pixels import Drawable
+from mtjax.envs.scenery import Visible
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task
 
@@ -61,7 +63,7 @@ _MJX_KEPT = ("x", "qpos", "qvel", "qacc_warmstart")
 
 
 @dataclasses.dataclass(frozen=True)
-class Brax(Family):
+class Brax(Drawable, Family):
     """Brax: an environment of Brax as it is.
 
     Observation (O,), after the step: Brax's own (brax.envs).
@@ -171,6 +173,24 @@ class Brax(Family):
     def engine_name(self) -> str:
         """Return the name of Brax's backend."""
         return self.backend
+
+    @property
+    def films(self) -> bool:  # type: ignore[override]
+        """Return whether there is anything to see."""
+        return self.environment != "fast"
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Return the length of a control step [s]."""
+        return float(self.original.dt)
+
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        """Return Brax's model of MuJoCo. What can vary does not show."""
+        return copy.copy(self.original.sys.mj_model)
+
+    def visible(self, task: Task, state: Any) -> Visible:
+        """Return the joints of a world, which all backends have."""
+        return Visible(state["qpos"] if self._is_mjx else state.q)
 
     @cached_property
     def action_size(self) -> int:  # type: ignore

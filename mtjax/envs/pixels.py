@@ -32,8 +32,28 @@ _LEAST, _MOST = 16, 512
 _MOST_FRAMES = 16
 
 
+class Drawable(abc.ABC):
+    """What a family has that MuJoCo draws in films: a scene for each task, and what it shows of a world."""
+
+    films: ClassVar[bool] = True
+    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
+
+    @property
+    @abc.abstractmethod
+    def seconds_per_step(self) -> float:
+        """Return the length of a step of the environment [s]."""
+
+    @abc.abstractmethod
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        """Return the compiled model of what is seen of the task in a row of the table. The caller may change it."""
+
+    @abc.abstractmethod
+    def visible(self, task: Task, state: Any) -> Visible:
+        """Return what a picture shows of a world."""
+
+
 @dataclasses.dataclass(frozen=True)
-class Pictured(abc.ABC):
+class Pictured(Drawable):
     """What a family has that can be seen. Derive from this and ``Family``: ``class Mine(Pictured, Family)``.
 
     The family says how a world moves, and what of it is observed, rewarded and drawn. Its observations are pictures if
@@ -64,8 +84,6 @@ class Pictured(abc.ABC):
     scenic: ClassVar[tuple[str, ...]] = ()  # parameters without an edit in which the scenes of tasks differ
     meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
     caster: ClassVar[type[Caster]] = Caster  # what painter=auto is
-    films: ClassVar[bool] = True
-    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
 
     def __post_init__(self):
@@ -113,6 +131,10 @@ class Pictured(abc.ABC):
         return self.compile_spec(values)
 
     # What every family does.
+
+    def scene_model(self, row: int) -> mujoco.MjModel:
+        """Return the compiled model of what is seen of the task in a row of the table."""
+        return compile_scene(self, {name: values[row] for name, values in self.variation.values.items()}).compile()
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance ``repeat`` control steps under ``action`` (A,) in [-1, 1]; observation and reward are those after it.
@@ -181,14 +203,9 @@ def compile_scene(family: Pictured, values: Mapping[str, float]) -> mujoco.MjSpe
     return spec
 
 
-def scene_model(family: Pictured, row: int) -> mujoco.MjModel:
-    """Return the compiled model of what is seen of the task in a row of the table."""
-    return compile_scene(family, {name: values[row] for name, values in family.variation.values.items()}).compile()
-
-
 def make_scenery(family: Pictured) -> Scenery:
     """Return what draws the worlds of a family on this device."""
-    scene = Scene(observed(scene_model(family, 0), family.hides))
+    scene = Scene(observed(family.scene_model(0), family.hides))
     painter = choose_painter(family.painter, family.meshes, family.caster)(scene, family.pixels)
     return Scenery(scene, _scene_leaves(family), painter, family.grey)
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from mtjax import envs
 from mtjax.envs.mixtures import require_family
-from mtjax.envs.pixels import Pictured
+from mtjax.envs.pixels import Drawable
 from mtjax.frames import PICTURES, shown
 from mtjax.gym.tasks import TaskStream, TaskTable, read_options
 from mtjax.names import nearest_error
@@ -156,7 +156,7 @@ def make(
             pictures of 84 x 84 and take each action for two steps; ``pixels=0`` shows the state.
         tasks: the split from which tasks are drawn: train, interpolation, extrapolation or all.
         task_obs: the observation of the task: "context", "id" or "none".
-        render_mode: "rgb_array" for families that show pictures, or None.
+        render_mode: "rgb_array" for families whose worlds can be drawn, or None.
         settings: fields of the family.
 
     Raises:
@@ -250,7 +250,7 @@ class FamilyEnv(TaskStream, gymnasium.Env):
 
 
 def _metadata(family: Env) -> dict[str, Any]:
-    if not isinstance(family, Pictured):
+    if not (isinstance(family, Drawable) and family.films):
         return {"render_modes": []}
     return {
         "render_modes": ["rgb_array"],

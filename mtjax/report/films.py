@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mtjax.checks import amount
 from mtjax.envs.engines import host
 from mtjax.envs.mixtures import FamilyOrMixture, apart
-from mtjax.envs.pixels import Pictured
+from mtjax.envs.pixels import Drawable
 from mtjax.envs.task_table import Part
 from mtjax.learning.evaluation import Recording, record, span_of
 from mtjax.names import InputError
@@ -47,7 +47,7 @@ class Chosen(NamedTuple):
 def require(env: FamilyOrMixture) -> None:
     """Raise InputError unless a family can be filmed."""
     if not any(part.family.films for part in env.parts):
-        raise InputError("only families that show pictures can be filmed; leave out --video")
+        raise InputError("only families whose worlds can be drawn can be filmed; leave out --video")
 
 
 def choose(env: FamilyOrMixture, splits: Sequence[str], tasks: Sequence[int]) -> list[Chosen]:
@@ -76,12 +76,12 @@ def choose_one(env: FamilyOrMixture, split: str, number: int) -> Chosen:
     """Return the task with a number in a split, for a film.
 
     Raises:
-        InputError: there is no such task, or its family shows no pictures.
+        InputError: there is no such task, or its worlds cannot be drawn.
     """
     for part in env.parts:
         for i in np.flatnonzero(part.places.get(split, np.zeros(0)) == number):
             if not part.family.films:
-                raise InputError(f"{part.name or 'this family'} shows no pictures")
+                raise InputError(f"worlds of {part.name or 'this family'} cannot be drawn")
             own = int(part.family.table.rows[split][i])
             return Chosen(part, split, int(part.places["all"][own]), own)
     raise InputError(f"there is no task {number} of {split}")
@@ -173,7 +173,7 @@ def _drawing(
     row, (first, length) = env.own_row(int(played.rows[one.place])), span_of(played.lengths[one.place], one.episode)
     shown, size = jax.tree.map(lambda x: x[one.own][first : first + length], states), (width, width * 3 // 4)
     kept = lambda i: family.pictures(jax.tree.map(lambda x: x[i : i + 1], shown), *size)[0]
-    opened = render.drawing(family, row, shown, *size, shadows) if isinstance(family, Pictured) else nullcontext(kept)
+    opened = render.drawing(family, row, shown, *size, shadows) if isinstance(family, Drawable) else nullcontext(kept)
     with opened as draw:
         of_step = lru_cache(1)(draw)
         yield lambda time: of_step(min(int(time * _steps_per_second(one)), length - 1))
@@ -224,7 +224,7 @@ def _tile(
     steps = np.unique(step_of)
     shown = jax.tree.map(lambda x: x[one.own][first + steps], states)  # also of keys, which NumPy has not
     size = width, width * 3 // 4
-    drawn = render.film(family, row, shown, *size) if isinstance(family, Pictured) else family.pictures(shown, *size)
+    drawn = render.film(family, row, shown, *size) if isinstance(family, Drawable) else family.pictures(shown, *size)
     frames = drawn[np.searchsorted(steps, step_of)]
     if acting is not None:
         below = timeline.strips(acting, one.place, step_of.tolist(), frames.shape[2], one.episode)

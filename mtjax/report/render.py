@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from mtjax.envs.painters.poses import Pose
-from mtjax.envs.pixels import Pictured, scene_model
+from mtjax.envs.pixels import Drawable
 from mtjax.envs.scenery import Mark, Visible
 from mtjax.types import InputError
 
@@ -41,7 +41,7 @@ def choose_backend() -> str:
 
 
 def film(
-    env: Pictured, task_row: int, states: Any, width: int = 320, height: int = 240, shadows: bool = True
+    env: Drawable, task_row: int, states: Any, width: int = 320, height: int = 240, shadows: bool = True
 ) -> np.ndarray:
     """Draw the task in row ``task_row`` of ``env.table`` in each of the states, leaves (H, ...).
 
@@ -60,7 +60,7 @@ def film(
 
 @contextlib.contextmanager
 def drawing(
-    env: Pictured, task_row: int, states: Any, width: int, height: int, shadows: bool = True
+    env: Drawable, task_row: int, states: Any, width: int, height: int, shadows: bool = True
 ) -> Iterator[Callable[..., np.ndarray]]:
     """Give a function that draws the task in row ``task_row`` in state ``i`` of states, leaves (H, ...), into an array.
 
@@ -73,11 +73,12 @@ def drawing(
     count = env.variation.count
     if not 0 <= task_row < count:
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {count - 1}")
-    model = scene_model(env, task_row)
+    model = env.scene_model(task_row)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     model.light_castshadow &= shadows
     data, task = mujoco.MjData(model), jax.tree.map(lambda x: x[task_row], env.table.tasks)
     shown = jax.tree.map(np.asarray, jax.vmap(partial(env.visible, task))(states))
+    camera = 0 if model.ncam else -1  # MuJoCo's own, which shows all of a model
     with _open_renderer(model, width, height) as renderer:
 
         def draw(i: int, out: np.ndarray | None = None) -> np.ndarray:
@@ -85,7 +86,7 @@ def drawing(
             data.qpos[:] = visible.joints
             _arrange(model, visible)
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, 0)
+            renderer.update_scene(data, camera)
             return renderer.render(out=out)
 
         yield draw

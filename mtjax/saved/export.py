@@ -16,7 +16,7 @@ from mtjax.checks import path
 from mtjax.envs import Family
 from mtjax.envs import name_of as env_name_of
 from mtjax.envs.contexts import ranges
-from mtjax.envs.pixels import Pictured
+from mtjax.envs.pixels import Drawable
 from mtjax.envs.scenery import GREY
 from mtjax.names import InputError, public
 from mtjax.saved import onnx
@@ -150,7 +150,7 @@ def _meta(env: Family, agent: BaseAgent, obs: dict[str, Any]) -> dict[str, Any]:
         "agent": name_of(agent),
         "obs": {name: x.shape for name, x in obs.items()},
         "frames": env.spec.frames,
-        "seconds": env.seconds_per_step if isinstance(env, Pictured) else None,  # between two actions
+        "seconds": env.seconds_per_step if isinstance(env, Drawable) and env.films else None,  # between two actions
         "about": " ".join(_about(env, name, x) for name, x in obs.items()),
         "action_size": env.spec.action_size,
         "action": str(env.spec.action),
