@@ -840,6 +840,16 @@ def test_ways_of_hindsight_are_compared_in_pairs_of_seeds(script, tmp_path):
     assert (tmp_path / "table.md").read_text().startswith("| way |")
 
 
+def test_returns_after_few_steps_have_a_line_for_each_split(script, tmp_path):
+    """And a column for each number of updates, or of episodes."""
+    returns = {"train": [[1, 2], [3, 4]], "extrapolation": [[5, 6], [7, 8]]}  # (S, K + 1)
+    (tmp_path / "plain.json").write_text(json.dumps({"returns": returns, "training_seconds": 7}))
+    lines = script("few_steps").table(tmp_path).splitlines()
+    assert lines[0] == "| way | split | after 0 | after 1 | training s |"
+    cells = [[x.split()[0] for x in line.strip("| ").split(" | ")] for line in lines[2:]]
+    assert cells == [["`plain`", "train", "2.0", "3.0", "7"], ["`plain`", "extrapolation", "6.0", "7.0", "7"]]
+
+
 def test_halving_is_compared_on_the_same_trials(script):
     """The rank of what it found among all that went to the end, one that diverged among them; or a refusal."""
     trial = lambda lr, *returns: {"values": {"lr": lr}, "returns": dict(zip("abc", returns, strict=False))}
