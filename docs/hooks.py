@@ -28,7 +28,7 @@ from mtjax.agents.hyperparameters import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
-from mtjax.envs.pixels import Drawable, Pictured
+from mtjax.envs.pixels import Pictured
 from mtjax.names import InputError, first_sentence
 from mtjax.report import figures
 
@@ -196,7 +196,7 @@ def family_page(name: str) -> str:
 
 def _described_bases(cls: type) -> list[type]:
     """Return the classes that a family is made from, up to those that all families are made from."""
-    bases = takewhile(lambda base: base not in (Domain, Pictured, Drawable, Family), cls.__mro__[1:])
+    bases = takewhile(lambda base: base not in (Domain, Pictured, Family), cls.__mro__[1:])
     return [base for base in bases if base.__doc__ and base.__module__.startswith("mtjax")]
 
 

@@ -22,7 +22,6 @@ import numpy as np
 from mtjax.envs.engines.base import mjx_module
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter, positive
-from mtjax.envs.pixels import Drawable
 from mtjax.envs.scenery import Visible
 from mtjax.names import nearest_error
 from mtjax.types import Array, InputError, Key, Step, Task
@@ -62,8 +61,31 @@ _SPEED_CONTROL_COST = 0.05
 _MJX_KEPT = ("x", "qpos", "qvel", "qacc_warmstart")
 
 
+# What is seen of Brax's worlds.
+
+
+def _has_sights(family: "Brax") -> bool:
+    """Return whether there is anything to see."""
+    return family.environment != "fast"
+
+
+def _control_seconds(family: "Brax") -> float:
+    """Return the length of a control step [s]."""
+    return float(family.original.dt)
+
+
+def _scene_model(family: "Brax", row: int) -> mujoco.MjModel:
+    """Return Brax's model of MuJoCo. What can vary does not show."""
+    return copy.copy(family.original.sys.mj_model)
+
+
+def _visible(family: "Brax", task: Task, state: Any) -> Visible:
+    """Return the joints of a world, which all backends have."""
+    return Visible(state["qpos"] if family._is_mjx else state.q)
+
+
 @dataclasses.dataclass(frozen=True)
-class Brax(Drawable, Family):
+class Brax(Family):
     """Brax: an environment of Brax as it is.
 
     Observation (O,), after the step: Brax's own (brax.envs).
@@ -174,23 +196,10 @@ class Brax(Drawable, Family):
         """Return the name of Brax's backend."""
         return self.backend
 
-    @property
-    def films(self) -> bool:  # type: ignore[override]
-        """Return whether there is anything to see."""
-        return self.environment != "fast"
-
-    @property
-    def seconds_per_step(self) -> float:
-        """Return the length of a control step [s]."""
-        return float(self.original.dt)
-
-    def scene_model(self, row: int) -> mujoco.MjModel:
-        """Return Brax's model of MuJoCo. What can vary does not show."""
-        return copy.copy(self.original.sys.mj_model)
-
-    def visible(self, task: Task, state: Any) -> Visible:
-        """Return the joints of a world, which all backends have."""
-        return Visible(state["qpos"] if self._is_mjx else state.q)
+    film_speed: ClassVar[float] = 1.0
+    films = property(_has_sights)  # type: ignore
+    seconds_per_step = property(_control_seconds)
+    scene_model, visible = _scene_model, _visible
 
     @cached_property
     def action_size(self) -> int:  # type: ignore

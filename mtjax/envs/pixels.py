@@ -9,7 +9,7 @@ import abc
 import dataclasses
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -32,28 +32,29 @@ _LEAST, _MOST = 16, 512
 _MOST_FRAMES = 16
 
 
-class Drawable(abc.ABC):
-    """What a family has that MuJoCo draws in films: a scene for each task, and what it shows of a world."""
+@runtime_checkable
+class Drawable(Protocol):
+    """What a family has that MuJoCo draws in films: a scene for each task, and what it shows of a world.
 
-    films: ClassVar[bool] = True
-    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
+    It has ``film_speed`` and ``seconds_per_step`` too, as every family that can be filmed.
+    """
 
-    @property
-    @abc.abstractmethod
-    def seconds_per_step(self) -> float:
-        """Return the length of a step of the environment [s]."""
-
-    @abc.abstractmethod
     def scene_model(self, row: int) -> mujoco.MjModel:
         """Return the compiled model of what is seen of the task in a row of the table. The caller may change it."""
+        ...
 
-    @abc.abstractmethod
     def visible(self, task: Task, state: Any) -> Visible:
         """Return what a picture shows of a world."""
+        ...
+
+
+def _scene_model(family: "Pictured", row: int) -> mujoco.MjModel:
+    """Return the compiled model of what is seen of the task in a row of the table."""
+    return compile_scene(family, {name: values[row] for name, values in family.variation.values.items()}).compile()
 
 
 @dataclasses.dataclass(frozen=True)
-class Pictured(Drawable):
+class Pictured(abc.ABC):
     """What a family has that can be seen. Derive from this and ``Family``: ``class Mine(Pictured, Family)``.
 
     The family says how a world moves, and what of it is observed, rewarded and drawn. Its observations are pictures if
@@ -84,6 +85,8 @@ class Pictured(Drawable):
     scenic: ClassVar[tuple[str, ...]] = ()  # parameters without an edit in which the scenes of tasks differ
     meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
     caster: ClassVar[type[Caster]] = Caster  # what painter=auto is
+    films: ClassVar[bool] = True
+    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
 
     def __post_init__(self):
@@ -132,9 +135,7 @@ class Pictured(Drawable):
 
     # What every family does.
 
-    def scene_model(self, row: int) -> mujoco.MjModel:
-        """Return the compiled model of what is seen of the task in a row of the table."""
-        return compile_scene(self, {name: values[row] for name, values in self.variation.values.items()}).compile()
+    scene_model = _scene_model
 
     def step(self, task: Task, state: Any, action: Array) -> Step:
         """Advance ``repeat`` control steps under ``action`` (A,) in [-1, 1]; observation and reward are those after it.
