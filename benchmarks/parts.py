@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,6 +43,21 @@ def add_flags(parser: argparse.ArgumentParser, seconds: float | None = None) -> 
         metavar="NUMBER",
         help="GPUs, each with one part at a time, by CUDA_VISIBLE_DEVICES; by default one part with all that are seen",
     )
+
+
+def run_ways(
+    script: str,
+    arguments: argparse.Namespace,
+    part: Callable[[argparse.Namespace, str], Part],
+    measure: Callable[[argparse.Namespace, str], None],
+    table: Callable[[Path], str],
+) -> None:
+    """Measure a way if this process is its part. Else run all ways that have no result yet, and print the table."""
+    if is_part():
+        return measure(arguments, arguments.ways[0])
+    left = run_parts(script, [part(arguments, way) for way in arguments.ways], arguments.out, arguments)
+    print(table(arguments.out))
+    require_all(left)
 
 
 def whole(text: str) -> int:

@@ -52,12 +52,7 @@ def main() -> None:
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the agent or the loop")
     parser.add_argument("--out", type=Path, default=Path("runs") / "resets")
     parts.add_flags(parser)
-    arguments = parser.parse_args()
-    if parts.is_part():
-        return measure(arguments, arguments.ways[0])
-    left = parts.run_parts(__file__, [part(arguments, way) for way in arguments.ways], arguments.out, arguments)
-    print(table(arguments.out))
-    parts.require_all(left)
+    parts.run_ways(__file__, parser.parse_args(), part, measure, table)
 
 
 def part(arguments: argparse.Namespace, way: str) -> parts.Part:

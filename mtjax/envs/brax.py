@@ -196,7 +196,6 @@ class Brax(Family):
         """Return the name of Brax's backend."""
         return self.backend
 
-    film_speed: ClassVar[float] = 1.0
     films = property(_has_sights)  # type: ignore
     seconds_per_step = property(_control_seconds)
     scene_model, visible = _scene_model, _visible

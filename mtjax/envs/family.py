@@ -65,6 +65,7 @@ class Family(abc.ABC):
     frames: ClassVar[int] = 1  # how many of the last pictures an agent sees at once, if it observes pictures
     ends_early: ClassVar[bool] = True  # whether episodes may end before their limit; it decides how resets are computed
     films: ClassVar[bool] = False  # whether its worlds can be seen in films
+    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     filmed: ClassVar[Callable[[], AbstractContextManager[None]]] = nullcontext  # a context to play filmed episodes in
     scenery: ClassVar[Any] = None  # what draws pictures that agents observe
     engine_name: ClassVar[str] = "jax"  # what steps its worlds: jax, or a physics engine or package

@@ -86,7 +86,6 @@ class Pictured(abc.ABC):
     meshes: ClassVar[bool] = False  # whether the scene is of meshes, which only Warp draws
     caster: ClassVar[type[Caster]] = Caster  # what painter=auto is
     films: ClassVar[bool] = True
-    film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     hides: ClassVar[tuple[str, ...]] = ()  # geoms that films show and observations do not, such as a hidden goal
 
     def __post_init__(self):

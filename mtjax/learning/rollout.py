@@ -258,8 +258,8 @@ def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:
     return transition._replace(next_obs=where_worlds(inside, worlds.obs, transition.next_obs))
 
 
-# Each of three ways to begin anew returns all worlds, of which those that have not ended are as they were. It returns
-# (S, T, E) bool too, which is false where a first observation is out of bounds.
+# There are three ways to begin anew. Each returns all worlds, and leaves those that have not ended as they were. Each
+# also returns (S, T, E) bool, false where a first observation is out of bounds.
 
 
 def _reset_all(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> tuple[_Begun, Array]:

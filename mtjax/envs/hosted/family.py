@@ -60,7 +60,6 @@ class Hosted(Acting, Family):
 
     suite: ClassVar[str]  # the first part of its name in mtjax
     forgets: ClassVar[bool] = True
-    film_speed: ClassVar[float] = 1.0
 
     def __post_init__(self):
         _ = self.fixed
