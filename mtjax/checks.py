@@ -15,8 +15,8 @@ import numpy as np
 from mtjax.names import InputError, nearest_error
 
 OF_TRAIN = (
-    *("steps", "seed", "seeds", "eval_every", "eval_episodes", "num_envs", "chunk_steps", "stagger", "trials"),
-    *("reset_free", "curriculum", "keep_replay", "population"),
+    *("steps", "seed", "seeds", "eval_every", "eval_episodes", "eval_sampled", "num_envs", "chunk_steps", "stagger"),
+    *("trials", "reset_free", "curriculum", "keep_replay", "population"),
 )
 """The settings of ``mtjax.train`` that are neither the agent's nor the environment's."""
 _LARGEST, _LARGEST_FLOAT = 2**31 - 1, 3.4e38  # of 32 bits

@@ -55,6 +55,9 @@ class Plan:
     in a short one."""
     eval_episodes: int = 10
     """Episodes of each task in every evaluation."""
+    eval_sampled: bool = False
+    """Draw the actions of evaluations from the policy, as in training. Else they are its mean ones, or the likeliest
+    choices."""
     population: str = ""
     """Train all seeds of all swept numbers as one population: pbt:STEPS or halving:STEPS. At evaluations, every STEPS
     environment steps of each member, pbt replaces the worst fifth by copies of the best fifth, with swept numbers

@@ -25,6 +25,8 @@ class Request:
     """Number of the setting in sweep.csv, if the run holds several settings of a sweep; of a member in a population."""
     episodes: int = 10
     """Episodes of each task and seed."""
+    sampled: bool = False
+    """Draw actions from the policy, as in training. Else they are its mean ones, or the likeliest choices."""
     seed: int = 0
     """Seed of the starting states."""
     task_seed: int = -1

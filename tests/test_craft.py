@@ -278,7 +278,7 @@ def test_held_out_tasks_have_known_symbols_in_new_orders():
         ({"held_out": ("sofa",)}, "held-out names tasks, such as plank; there is no sofa"),
         ({"held_out": NAMES, "split": "dense"}, "held-out leaves no task to train on"),
         ({"symbol_steps": 0}, "symbol-steps must be at least 1, not 0"),
-        ({"cells": 3}, "cells must be a whole number from 4 to 50, not 3"),
+        ({"cells": 3}, "cells must be a whole number from 4 to 30, not 3"),
         ({"copies": 12}, "copies must be at least 1 and at most 11 with cells=8, .* not 12"),
         ({"sketched": True, "pixels": 64}, "pictures do not show the symbol that is due"),
         ({"vary": {"goal": "sofa"}}, "cannot read the values 'sofa' of goal"),

@@ -116,7 +116,7 @@ def test_last_evaluation_of_a_run_is_of_its_last_policy(finished_run, policy):
 def test_scores_are_of_episodes_that_the_run_never_saw(finished_run, policy):
     """Though policy and tasks are those of its last evaluation."""
     past = load_evaluations(finished_run / "evaluations.npz")
-    for split, (returns, _) in scoring.score(policy, 1).items():
+    for split, (returns, _) in scoring.score(policy, Episodes(1)).items():
         assert returns.shape == (2, len(VALUES[split]), 1)
         assert not np.intersect1d(returns, past.returns[split]).size
 
@@ -189,6 +189,32 @@ class Counting(Lost):
     def step(self, task, state, action):
         step = super().step(task, state, action)
         return step._replace(metrics={"steps": step.state.age})
+
+
+class Doubtful(Stub):
+    """Draws -1 or 1, and takes 1 without a key."""
+
+    def choose(self, state, obs, task, key):
+        return jnp.ones(1) if key is None else 2.0 * jax.random.bernoulli(key, shape=(1,)) - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Paid(Walk):
+    """A walk that earns the action."""
+
+    def rules(self, task, state, action):
+        return jnp.sum(action), state.obs[0], False
+
+
+def test_drawn_actions_are_fresh_in_every_step_and_episode():
+    """Sums of five draws of -1 or 1 are of all kinds; the likeliest action earns 5 in every episode."""
+    tasks = tasks_of("one-step", (1.0,))._replace(horizon=jnp.int32([5]))
+    play = lambda sampled: evaluate(
+        Paid(), Doubtful(), Episodes(200, sampled=sampled), jnp.zeros(1), tasks, jnp.asarray([3]), jnp.int32(0)
+    )
+    likeliest, drawn = (np.asarray(play(sampled).returns)[0, 0] for sampled in (False, True))
+    assert np.all(likeliest == 5)
+    assert set(drawn) == {-5, -3, -1, 1, 3, 5} and abs(drawn.mean()) < 4 * np.sqrt(5 / 200)
 
 
 def test_an_episode_whose_world_is_lost_keeps_what_it_had():

@@ -17,6 +17,7 @@ import mtjax.evaluate
 from mtjax import agents
 from mtjax.command import add_pretrained as command
 from mtjax.command.run_config import parse
+from mtjax.learning.evaluation import Episodes
 from mtjax.report import films
 from mtjax.report.scoring import score
 from mtjax.saved import policy_files, pretrained
@@ -128,5 +129,5 @@ def test_a_policy_scores_what_its_page_says(name):
     told = re.search(rf"^\| `{name}` \|.*?\| (\d+) \|", PAGE.read_text(), re.MULTILINE)
     assert told, f"{PAGE.name} has no row of {name}"
     episodes = 20 if name.startswith(("racing", "sailing")) else 2
-    found = score(mtjax.load(name), episodes)["train"].returns.mean()
+    found = score(mtjax.load(name), Episodes(episodes))["train"].returns.mean()
     assert abs(found - float(told[1])) < 0.05 * float(told[1]), found

@@ -14,6 +14,7 @@ import mtjax
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing import text as sentences
 from mtjax.envs import ENVS
+from mtjax.learning.evaluation import Episodes
 from mtjax.report import scoring
 from mtjax.types import InputError, Spec
 
@@ -175,5 +176,5 @@ def test_a_run_reads_and_its_policy_acts_on_held_out_tasks(hashing, tmp_path):
     vectors = policy.state.nets["tasks"].shared["given"]
     np.testing.assert_allclose(vectors, hashing(*family.sentences), atol=1e-6)
     assert len(vectors) == len(family.tasks("all").id) > 2
-    returns = scoring.score(policy, episodes=1)["extrapolation"].returns
+    returns = scoring.score(policy, Episodes(1))["extrapolation"].returns
     assert returns.size and np.isfinite(returns).all()

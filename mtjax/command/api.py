@@ -44,6 +44,7 @@ def train(
     seed: int = Plan.seed,
     eval_every: int = Plan.eval_every,
     eval_episodes: int = Plan.eval_episodes,
+    eval_sampled: bool = Plan.eval_sampled,
     population: str = Plan.population,
     settings: Settings | None = None,
     start: Policy | str | Path | Sequence[Policy | str | Path] | None = None,
@@ -75,6 +76,8 @@ def train(
         seed: the first seed.
         eval_every: environment steps between evaluations. 0 means ten evaluations in the run.
         eval_episodes: episodes of each task in every evaluation.
+        eval_sampled: draw the actions of evaluations from the policy; else they are its mean ones, or the likeliest
+            choices.
         population: "pbt:STEPS" or "halving:STEPS" makes a population of all seeds of all points of ``sweep``, as
             ``--population`` does.
         settings: settings of the training loop; by default the preset's for a name, else ``Settings()``.
@@ -114,7 +117,7 @@ def train(
         names = ", ".join(["resume", *written])
         raise InputError(f"{names} need the run's folder; give directory as well")
     plan = {"seeds": seeds, "seed": seed, "eval_every": eval_every, "eval_episodes": eval_episodes}
-    plan |= {"population": population}
+    plan |= {"eval_sampled": eval_sampled, "population": population}
     plan |= {} if steps is None else {"steps": steps}
     if agent is None and begun is not None:
         agent = (begun if isinstance(begun, Policy) else begun[0]).agent

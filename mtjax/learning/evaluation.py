@@ -1,4 +1,4 @@
-"""Evaluation plays whole trials under the mean action, on any tasks, with keys of its own.
+"""Evaluation plays whole trials under the mean action or drawn ones, on any tasks, with keys of its own.
 
 Trials that draw their tasks play all draws of a task before one comes again, as benchmarks with listed goals ask.
 
@@ -29,10 +29,11 @@ _EVER = "success_ever"  # the metric that success was 1 at any step of an episod
 
 
 class Episodes(NamedTuple):
-    """Says how many episodes of each task an evaluation plays, in trials of how many."""
+    """Says how many episodes of each task an evaluation plays, in trials of how many, and by which actions."""
 
     count: int  # a multiple of ``trial``
     trial: int = 1
+    sampled: bool = False  # draw actions from the policy; else take its mean ones, or the likeliest choices
 
 
 class Scores(NamedTuple):
@@ -175,7 +176,7 @@ def evaluate(
     number: Array,
     places: Array | None = None,
 ) -> Scores:
-    """Play whole trials under the mean action.
+    """Play whole trials under the mean action, or under drawn ones.
 
     An episode whose world is lost (``step_envs``) keeps what it had before.
 
@@ -196,7 +197,8 @@ def evaluate(
 
     def step(carry, time: Array):
         before, scores, alive = carry
-        worlds, env_step = step_envs(env, agent, state, tasks, before, None, trials=trials)
+        drawn = _at(keys, -1 - time) if episodes.sampled else None  # those from 0 on begin episodes
+        worlds, env_step = step_envs(env, agent, state, tasks, before, drawn, trials=trials)
         worlds = _go_on(env, agent, state, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
         now = alive[..., None] & _is_now(before, trials.episodes)
         # Rewards after an episode's end may not be finite.

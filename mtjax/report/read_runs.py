@@ -160,7 +160,8 @@ def _points(found: Found) -> Iterable[tuple[Any, dict[str, Any], Learned]]:
             seeds,
             mine.metrics,
         )
-        shape = (evaluations.steps.tolist(), config.plan.eval_episodes, config.start)
+        plan = config.plan
+        shape = (evaluations.steps.tolist(), plan.eval_episodes, plan.eval_sampled, config.start)
         yield (config.env, name, family, sorted(own.items(), key=str), shape), own, one
 
 

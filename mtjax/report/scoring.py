@@ -19,7 +19,7 @@ from mtjax.envs.engines import host
 from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.envs.naming import ends
 from mtjax.learning import evaluation, trials
-from mtjax.learning.evaluation import Scores, of_tasks
+from mtjax.learning.evaluation import Episodes, Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
@@ -75,6 +75,7 @@ def evaluate(
     vary: Mapping[str, Any] | None = None,
     split: str | None = None,
     episodes: int = 10,
+    sampled: bool = False,
     seed: int = 0,
     task_seed: int | None = None,
     point: int = 0,
@@ -89,6 +90,7 @@ def evaluate(
         vary: other values of parameters than the run's, by name: ``{"size": "0.9:1.3:5"}`` or a list.
         split: the split to play: train, interpolation or extrapolation. None plays all.
         episodes: of each task and seed.
+        sampled: draw actions from the policy; else they are its mean ones, or the likeliest choices.
         seed: seed of the starting states.
         task_seed: seed of other goals than the run's, or other tasks, where they are drawn.
         point: number of the setting, if the run holds several settings of a sweep; of a population, of the member,
@@ -108,7 +110,7 @@ def evaluate(
     policy, tasks, named = with_tasks(_policy(run, point, checkpoint), vary or {}, task_seed)
     if split is not None and not len(policy.env.tasks(split).id):
         raise InputError(f"this run has no tasks of the split {split}")
-    scores = score(policy, episodes, seed, tasks, split or "all")
+    scores = score(policy, Episodes(episodes, policy.trial, sampled), seed, tasks, split or "all")
     found = {named.get(name, name): (name, one) for name, one in scores.items() if one.returns.size}
     metrics = list(next(iter(scores.values())).metrics)
     return Evaluation(
@@ -177,7 +179,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
     tasks = policy.env.tasks("all") if tasks is None else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
-    scores = score(policy, request.episodes, request.seed, tasks)
+    scores = score(policy, Episodes(request.episodes, policy.trial, request.sampled), request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
     if told := describe_unseen(policy.agent):
         print(f"unseen tasks: {told}")
@@ -245,7 +247,7 @@ def _entry(point: Any, points: int, seeds: int, population: str) -> int:
 
 
 def score(
-    policy: Policy, episodes: int, seed: int = 0, tasks: Task | None = None, split: str = "all"
+    policy: Policy, episodes: Episodes, seed: int = 0, tasks: Task | None = None, split: str = "all"
 ) -> dict[str, Scores]:
     """Return the scores (S, T, episodes) of each split, in whole trials of episodes that no training run has seen.
 
@@ -256,13 +258,12 @@ def score(
     Raises:
         InputError: the episodes are no whole number of trials, or an environment outside of JAX has raised an error.
     """
-    trials.require_whole(episodes, policy.trial)
+    trials.require_whole(episodes.count, episodes.trial)
     env = policy.env
     rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
     arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
     arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))
-    played = evaluation.Episodes(episodes, policy.trial)
-    program = trace(evaluation.evaluate, env, policy.agent, played, *arguments)
+    program = trace(evaluation.evaluate, env, policy.agent, episodes, *arguments)
     with host.explaining():
         found = jax.block_until_ready(compile_lowered(program.lower(), "seldom")(*arguments))
     return {split: found} if split in rows else {name: of_tasks(found, places) for name, places in rows.items()}

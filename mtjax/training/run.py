@@ -125,7 +125,8 @@ class _Run:
         kernels = pool.submit(load_kernels, env)
         make = None if resume else pool.submit(lambda: compile_lowered(fresh.lower(), "once"))
         chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
-        episodes = Episodes(self.config.plan.eval_episodes, settings.trials)
+        plan = self.config.plan
+        episodes = Episodes(plan.eval_episodes, settings.trials, plan.eval_sampled)
         played = partial(trace, lazy.evaluate, env, agent, episodes, shapes.agent, everything, seeds)
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower(), "seldom"))
         pool.shutdown(wait=False)

@@ -1,7 +1,9 @@
 """A walled grid of things: workshops, and raw materials to take. One cell holds one thing."""
 
 import dataclasses
+import operator
 from collections.abc import Mapping
+from functools import partial, reduce
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -40,7 +42,9 @@ _PAINTS = {
     "gem": (0.5, 0.95, 0.95, 1.0),
 }
 _WALL, _SKIN, _NOSE = (0.35, 0.3, 0.27, 1.0), (0.95, 0.95, 0.95, 1.0), (0.1, 0.1, 0.1, 1.0)
-_LEAST, _MOST = 4, 50  # cells
+_BITS = 32  # of a number that holds a column of cells
+_LEAST, _MOST = 4, _BITS - 2  # cells
+_AT_ONCE = 8  # layouts of a round, of which the first that can be reached is taken
 _UNDER = -5.0  # [m] height of what is not there
 
 
@@ -86,7 +90,14 @@ class OnGrid(Sketched):
     # Layouts.
 
     def begin(self, task: Task, key: Key) -> Grid:
-        return draw_until(reachable, lambda key: self.lay_out(self.treasure(task), key), key)
+        # Many worlds are drawn until the last of them is sound, and an accelerator waits for the host after each round.
+        def draw(key: Key) -> tuple[Grid, Array]:
+            each = jax.vmap(partial(self.lay_out, self.treasure(task)))(jax.random.split(key, _AT_ONCE))
+            sound = jax.vmap(reachable)(each)
+            first = jnp.argmax(sound)
+            return jax.tree.map(lambda x: x[first], each), sound[first]
+
+        return draw_until(lambda drawn: drawn[1], draw, key)[0]
 
     def treasure(self, task: Task) -> Array:
         """Return the kinds () of a treasure and of the ring around it; 0 for none."""
@@ -95,19 +106,18 @@ class OnGrid(Sketched):
     def lay_out(self, treasure: Array, key: Key) -> Grid:
         """Draw a grid: a treasure (2,) beside the lower boundary, all other things and the walker anywhere."""
         place_key, order_key = jax.random.split(key)
-        size, line = self.cells + 2, np.arange(self.cells + 2)
-        x, y = np.meshgrid(line, line, indexing="ij")
-        inside = (x % (size - 1) > 0) & (y % (size - 1) > 0)
-        middle = jax.random.randint(place_key, (), 1, size - 1)
-        ring = inside & (jnp.abs(x - middle) <= 1) & (y <= 2)
-        things = jnp.where(inside, jnp.where(ring, treasure[1], EMPTY), BOUNDARY)
-        things = things.at[middle, 1].set(treasure[0]).astype(jnp.int32)
-        free = (things == EMPTY).ravel()
-        order = jnp.argsort(jnp.where(free, jax.random.uniform(order_key, free.shape), 2.0))
-        each = np.array([*np.repeat(PLENTY, self.copies), *WORKSHOPS])
-        things = things.ravel().at[order[: len(each)]].set(each).reshape(size, size)
-        place = jnp.stack(jnp.divmod(order[len(each)], size)).astype(jnp.int32)
-        return Grid(things, place, jnp.int32(DOWN), jnp.zeros(self.num_items, jnp.int32))
+        x, y = np.meshgrid(np.arange(self.cells), np.arange(self.cells), indexing="ij")
+        middle = jax.random.randint(place_key, (), 0, self.cells)
+        ring, inmost = (jnp.abs(x - middle) <= 1) & (y <= 1), (x == middle) & (y == 0)
+        things = jnp.where(inmost, treasure[0], jnp.where(ring, treasure[1], EMPTY)).astype(jnp.int32)
+        lots = jax.random.uniform(order_key, things.shape) - (things != EMPTY)
+        each = np.array([*np.repeat(PLENTY, self.copies), *WORKSHOPS], np.int32)
+        # The barrier keeps XLA from sorting all lots, which takes a CPU three times as long.
+        order = jax.lax.optimization_barrier(jax.lax.top_k(lots.ravel(), len(each) + 1)[1])
+        things = things.ravel().at[order[:-1]].set(each).reshape(x.shape)
+        place = 1 + jnp.stack(jnp.divmod(order[-1], self.cells))
+        walled = jnp.pad(things, 1, constant_values=BOUNDARY)
+        return Grid(walled, place, jnp.int32(DOWN), jnp.zeros(self.num_items, jnp.int32))
 
     # Steps.
 
@@ -189,30 +199,56 @@ def surroundings(world: Grid) -> tuple[Array, Array]:
 
     What is off the grid holds nothing. Kinds are all but "empty".
     """
-    kinds = jax.nn.one_hot(world.things - 1, len(KINDS) - 1)
-    cells = np.arange(len(world.things))
-    away = cells - world.place[:, None]  # (2, N + 2)
     wide = 2 * _NEAR + 1
-    near = jax.nn.one_hot(away + _NEAR, wide, axis=1)  # (2, 5, N + 2)
-    far = jax.nn.one_hot((away + _BLOCK * wide // 2) // _BLOCK, wide, axis=1)
-    gather = lambda chosen: jnp.einsum("ax,by,xyk->abk", *chosen, kinds)
-    return gather(near), jnp.minimum(gather(far), 1.0)
+    reach = _BLOCK * wide // 2
+    sets = jnp.where(world.things == EMPTY, 0, 1 << jnp.maximum(world.things - 1, 0))  # of kinds, a bit for each
+    around = jax.lax.dynamic_slice(jnp.pad(sets, reach), world.place, 2 * [_BLOCK * wide])
+    near = around[reach - _NEAR : reach + _NEAR + 1, reach - _NEAR : reach + _NEAR + 1]
+    columns = reduce(operator.or_, jnp.moveaxis(around.reshape(wide, _BLOCK, -1), 1, 0))
+    far = reduce(operator.or_, jnp.moveaxis(columns.reshape(wide, wide, _BLOCK), 2, 0))
+    members = lambda sets: (sets[..., None] >> np.arange(len(KINDS) - 1) & 1).astype(jnp.float32)
+    return members(near), members(far)
 
 
 def reachable(world: Grid) -> Array:
     """Return whether () the walker can come to the side of all raw material, workshops and treasure, as they lie."""
-    things = world.things
-    free = things == EMPTY
-    start = jnp.zeros_like(free).at[world.place[0], world.place[1]].set(True)
-    grow = lambda cells: (cells[1], cells[1] | (spread(cells[1]) & free))  # the cells before and after a step
-    _, seen = jax.lax.while_loop(lambda cells: jnp.any(cells[0] != cells[1]), grow, (~start, start))
-    beside = spread(seen)
-    treasure, ring = things >= GOLD, (things == WATER) | (things == STONE)
-    crossed = ~jnp.any(treasure) | jnp.any(beside & ring & spread(treasure))
-    return jnp.all(beside | ~jnp.isin(things, jnp.array([*PLENTY, *WORKSHOPS]))) & crossed
+    things, (x, y) = world.things, world.place
+    free = columns(things == EMPTY)
+    start = jnp.zeros_like(free).at[x].set(1 << y.astype(jnp.uint32))
+    grow = lambda seen: fill(seen | beside(seen) & free, free)
+    changes = lambda cells: jnp.any(cells[0] != cells[1])
+    _, seen = jax.lax.while_loop(changes, lambda cells: (cells[1], grow(cells[1])), (jnp.zeros_like(start), start))
+    at_hand = spread(seen)
+    treasure, ring = columns(things >= GOLD), columns((things == WATER) | (things == STONE))
+    crossed = ~jnp.any(treasure) | jnp.any(at_hand & ring & spread(treasure))
+    wanted = columns((things >= WORKSHOP) & (things < GOLD))
+    return ~jnp.any(wanted & ~at_hand) & crossed
+
+
+# Sets of cells are (N,) uint32: a number for each x, with a bit for each y. None has cells of the outermost ones.
+
+
+def columns(cells: Array) -> Array:
+    """Return the set of the cells (N, N) bool."""
+    return jnp.sum(cells.astype(jnp.uint32) << np.arange(cells.shape[1], dtype=np.uint32), axis=1, dtype=jnp.uint32)
+
+
+def beside(cells: Array) -> Array:
+    """Return the cells to the left and to the right of these."""
+    padded = jnp.pad(cells, 1)
+    return padded[2:] | padded[:-2]
 
 
 def spread(cells: Array) -> Array:
-    """Return the cells (N, N) bool that share a side with one of these; none is at the edge."""
-    padded = jnp.pad(cells, 1)
-    return padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
+    """Return these cells, and those that share a side with one of them."""
+    return cells | cells << 1 | cells >> 1 | beside(cells)
+
+
+def fill(cells: Array, free: Array) -> Array:
+    """Return these free cells, and the free ones that lie below and above without another between."""
+    below = above = cells
+    open_below = open_above = free
+    for i in range(_BITS.bit_length() - 1):
+        below, open_below = below | open_below & below >> (1 << i), open_below & open_below >> (1 << i)
+        above, open_above = above | open_above & above << (1 << i), open_above & open_above << (1 << i)
+    return below | above

@@ -1,0 +1,118 @@
+"""Measure what policy sketches are worth in the craft world: Andreas et al. 2017, with their ablations.
+
+    python benchmarks/sketches.py [--env=craft-sketched] [--ways NAME ...] [--seeds 10] [--steps N] [--evaluations 10]
+                                  [--episodes 100] [--training NAME=VALUE ...] [--within SECONDS] [--devices 0 ...]
+                                  [--out DIR]
+
+All ways are the agent ``sketches`` and follow the sketch of their task, so that they see which symbol is due:
+
+- ``modular``: a sub-policy for each symbol, and tasks with short sketches first;
+- ``independent``: a policy for each task;
+- ``joint``: one policy, which is told its task;
+- ``no-curriculum``: as modular, but all tasks count alike from the start;
+- ``zero-shot``: as modular, without the family's held-out tasks, which it plays by their sketches alone;
+- ``joint-zero-shot``: as joint, told the sketch, without the held-out tasks, which it plays too.
+
+Every way is a process of its own with all seeds in one program, and writes ``OUT/WAY.json`` with the returns (S, V, T)
+of all evaluations by split: shares of episodes that made what their task asks for, under drawn actions, as in the
+paper. Finished ways are not run again; one that was stopped goes on from ``OUT/WAY.run`` if the same command is given
+again. The table has the last evaluation: the mean over tasks, that of the worst task, and that over held-out tasks.
+"""
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import parts
+import resumable
+from report import markdown, record, run_main, settings_of
+
+from mtjax.compiling.programs import enable_compile_cache
+from mtjax.report import stats
+
+_JOINT = {"sharing": "all", "sampler": "by-length"}
+WAYS: dict[str, dict[str, Any]] = {
+    "modular": {"split": "none"},
+    "independent": {"split": "none", "sharing": "tasks"},
+    "joint": {"split": "none", "conditioning": "one-hot", **_JOINT},
+    "no-curriculum": {"split": "none", "sampler": "uniform"},
+    "zero-shot": {"split": "dense"},
+    "joint-zero-shot": {"split": "dense", "conditioning": "parameters", **_JOINT},
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="craft-sketched")
+    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS), metavar="WAY")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--steps", type=parts.whole, help="of each seed, summed over tasks; by default the preset's")
+    parser.add_argument("--evaluations", type=int, default=10)
+    parser.add_argument("--episodes", type=int, default=100, help="of each task in an evaluation")
+    parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of agent, loop and family")
+    parser.add_argument("--out", type=Path, default=Path("runs") / "sketches")
+    parts.add_flags(parser)
+    parts.run_ways(__file__, parser.parse_args(), part, measure, table)
+
+
+def part(arguments: argparse.Namespace, way: str) -> parts.Part:
+    """Return the part of a way."""
+    options = [f"--{name}={getattr(arguments, name)}" for name in ("env", "seeds", "evaluations", "episodes", "out")]
+    options += [f"--steps={arguments.steps}"] * bool(arguments.steps)
+    return parts.Part(way, [*options, "--ways", way, "--training", *arguments.training])
+
+
+def measure(arguments: argparse.Namespace, way: str) -> None:
+    """Learn the tasks, or go on with the run that was stopped, and write the returns of all evaluations."""
+    enable_compile_cache()
+    folder = arguments.out / f"{way}.run"
+    given = WAYS[way] | settings_of(arguments.training)
+    if arguments.steps:
+        given |= {"steps": arguments.steps, "eval_every": arguments.steps // arguments.evaluations}
+    result = resumable.train(
+        folder,
+        arguments.env,
+        "sketches",
+        seeds=arguments.seeds,
+        eval_episodes=arguments.episodes,
+        eval_sampled=True,
+        quiet=False,
+        **given,
+    )
+    found = result.evaluations
+    returns = {split: np.round(x.mean(axis=-1, dtype=np.float64), 4) for split, x in found.returns.items()}
+    figures = {
+        "way": way,
+        "tasks": {split: list(result.env.labels(split)) for split in returns},
+        "returns": {split: x.tolist() for split, x in returns.items()},
+        **resumable.summary(result),
+    }
+    parts.write_result(arguments.out / f"{way}.json", record(arguments, figures))
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def table(out: Path) -> str:
+    """Return the last returns of all ways that have finished, and write them as ``OUT/table.md``."""
+    paths = {way: out / f"{way}.json" for way in WAYS}
+    found = {way: json.loads(path.read_text()) for way, path in paths.items() if path.exists()}
+    titles = ["way", "mean", "worst task", "held-out tasks", "million steps", "training s"]
+    text = markdown(titles, [line(way, result) for way, result in found.items()])
+    (out / "table.md").write_text(text + "\n")
+    return text
+
+
+def line(way: str, result: dict[str, Any]) -> list[str]:
+    """Return the cells of a way."""
+    last = {split: np.array(x)[:, -1] for split, x in result["returns"].items()}
+    scores = [last["train"].mean(axis=1), last["train"].min(axis=1)]
+    scores += [last["interpolation"].mean(axis=1)] * bool(last["interpolation"].size)
+    cells = [f"{stats.seed_interval(x):.2f}" for x in scores]
+    cells += ["-"] * (3 - len(cells))
+    return [f"`{way}`", *cells, f"{result['steps'][-1] / 1e6:.0f}", f"{result['training_seconds']:.0f}"]
+
+
+if __name__ == "__main__":
+    run_main(main)
