@@ -15,13 +15,12 @@ All ways are the agent ``sketches`` and follow the sketch of their task, so that
 
 Every way is a process of its own with all seeds in one program, and writes ``OUT/WAY.json`` with the returns (S, V, T)
 of all evaluations by split: shares of episodes that made what their task asks for, under drawn actions, as in the
-paper. Finished ways are not run again; one that was stopped goes on from ``OUT/WAY.run`` if the same command is given
-again. The table has the last evaluation: the mean over tasks, that of the worst task, and that over held-out tasks.
+paper. ``OUT/WAY.run`` is its run. Finished ways are not run again; one that was stopped goes on if the same command is
+given again. The table has the last evaluation: the mean over tasks, that of the worst task, and that over held-out tasks.
 """
 
 import argparse
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +90,6 @@ def measure(arguments: argparse.Namespace, way: str) -> None:
         **resumable.summary(result),
     }
     parts.write_result(arguments.out / f"{way}.json", record(arguments, figures))
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def table(out: Path) -> str:
