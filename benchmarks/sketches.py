@@ -16,7 +16,8 @@ All ways are the agent ``sketches`` and follow the sketch of their task, so that
 Every way is a process of its own with all seeds in one program, and writes ``OUT/WAY.json`` with the returns (S, V, T)
 of all evaluations by split: shares of episodes that made what their task asks for, under drawn actions, as in the
 paper. ``OUT/WAY.run`` is its run. Finished ways are not run again; one that was stopped goes on if the same command is
-given again. The table has the last evaluation: the mean over tasks, that of the worst task, and that over held-out tasks.
+given again. The table has the last evaluation: the mean over tasks, the worst task of each seed, and the mean over
+held-out tasks.
 """
 
 import argparse

@@ -25,7 +25,7 @@ SPEC = Spec.vector(3, 2, 1)._replace(sentences=("Walk.", "Run.", "Walk with size
 @pytest.fixture
 def hashing():
     require("sklearn")
-    return lambda *said: sentences.encode("hashing", said)
+    return lambda *said, learned=None: sentences.encode("hashing", said, len(said) if learned is None else learned)
 
 
 # Sentences.
@@ -92,6 +92,20 @@ def test_hashing_tells_numbers_apart_and_their_signs(hashing):
     assert np.max(vectors @ vectors.T - np.eye(3)) < 0.95
 
 
+def test_words_that_training_has_not_are_left_out(hashing):
+    """What is left of a sentence is what it shares with those of training, at the same places."""
+    *known, new = hashing("Go to the red door.", "Walk to the blue door.", "Run to the red door.", learned=2)
+    assert not np.any(new[np.all(np.array(known) == 0, axis=0)]) and new @ known[0] > 0.7
+    assert np.any(hashing("Go to the red door.", "Run to the red door.")[1][np.array(known[0]) == 0])
+
+
+def test_order_is_told_beside_a_new_word(hashing):
+    """Two things in either order, with a verb that training has not: only their places differ."""
+    said = [f"{verb} past {x}, {verb} past {y}." for verb in ("Go", "Run") for x, y in ("ab", "ba")]
+    *known, first, second = hashing(*said, learned=2)
+    assert first @ second < 0.9 and first @ known[0] > first @ known[1] + 0.1
+
+
 def test_a_model_of_sentences_is_asked_once(monkeypatch):
     asked = []
 
@@ -104,7 +118,7 @@ def test_a_model_of_sentences_is_asked_once(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "sentence_transformers", types.SimpleNamespace(SentenceTransformer=Model))
     for _ in range(2):
-        vectors = sentences.encode("some-model", ("four", "sixsix"))
+        vectors = sentences.encode("some-model", ("four", "sixsix"), 2)
     np.testing.assert_allclose(vectors, [[0.8, 0.6], [0.8944272, 0.4472136]], atol=1e-6)
     assert asked == ["some-model"]
 
@@ -132,7 +146,7 @@ class Refuses:
 def test_what_is_missing_is_named(module, found, encoder, said, message, monkeypatch):
     monkeypatch.setitem(sys.modules, module, found)
     with pytest.raises(InputError, match=message):
-        sentences.encode.__wrapped__(encoder, said)
+        sentences.encode.__wrapped__(encoder, said, len(said))
 
 
 # Agents.
@@ -140,7 +154,7 @@ def test_what_is_missing_is_named(module, found, encoder, said, message, monkeyp
 
 def test_an_agent_reads_a_tasks_own_sentence_also_of_a_held_out_task(hashing):
     """A task of other splits' making has the sentence of the training task whose context is nearest."""
-    agent, vectors = tiny("sac", conditioning="text"), hashing(*SPEC.sentences)
+    agent, vectors = tiny("sac", conditioning="text"), hashing(*SPEC.sentences, learned=2)
     state = jax.eval_shape(lambda: agent.init(SPEC, TASKS, KEY))
     known = Params({"given": agent.conditioning.table(SPEC, 2), "known": TASKS.context}, {})
     assert jax.tree.structure(known) == jax.tree.structure(state.nets["tasks"])
@@ -174,7 +188,7 @@ def test_a_run_reads_and_its_policy_acts_on_held_out_tasks(hashing, tmp_path):
     )
     policy = mtjax.load(tmp_path / "run")
     vectors = policy.state.nets["tasks"].shared["given"]
-    np.testing.assert_allclose(vectors, hashing(*family.sentences), atol=1e-6)
+    np.testing.assert_allclose(vectors, hashing(*family.sentences, learned=2), atol=1e-6)
     assert len(vectors) == len(family.tasks("all").id) > 2
     returns = scoring.score(policy, Episodes(1))["extrapolation"].returns
     assert returns.size and np.isfinite(returns).all()
