@@ -14,7 +14,7 @@ the held-out tasks, made of the same parts in other orders, are learned in five 
 Seeds are paired: each way begins from the networks of its own seed. Every run is a process of its own with all seeds in
 one program, in ``OUT/RUN.run``, and writes ``OUT/RUN.json`` with the returns (S, V) of every evaluation, means over
 tasks and episodes. Finished runs are not run again; one that was stopped goes on if the same command is given again.
-The table has the return before, at the end, and on average over the evaluations, that is the area under the curve.
+The table has the return in the first evaluation, in the last, and on average over the evaluations, that is the area under the curve.
 ``--training`` replaces settings of both agents, the loop and the family, such as ``num_envs=32``.
 """
 
@@ -109,7 +109,7 @@ def table(out: Path) -> str:
         rows.append(
             [way, *(f"{stats.seed_interval(x):.2f}" for x in (scores[:, 0], scores[:, -1], areas)), f"{gained:+.2f}"]
         )
-    return markdown(["way", "before", "at the end", "on average", "on average, less scratch"], rows)
+    return markdown(["way", "at first", "at the end", "on average", "on average, less scratch"], rows)
 
 
 if __name__ == "__main__":
