@@ -14,7 +14,8 @@ the held-out tasks, made of the same parts in other orders, are learned in five 
 Seeds are paired: each way begins from the networks of its own seed. Every run is a process of its own with all seeds in
 one program, in ``OUT/RUN.run``, and writes ``OUT/RUN.json`` with the returns (S, V) of every evaluation, means over
 tasks and episodes. Finished runs are not run again; one that was stopped goes on if the same command is given again.
-The table has the return in the first evaluation, in the last, and on average over the evaluations, that is the area under the curve.
+The table has the return in the first evaluation, in the last, and on average over the evaluations, that is the area
+under the curve.
 ``--training`` replaces settings of both agents, the loop and the family, such as ``num_envs=32``.
 """
 
