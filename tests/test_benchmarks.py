@@ -850,6 +850,18 @@ def test_returns_after_few_steps_have_a_line_for_each_split(script, tmp_path):
     assert cells == [["`plain`", "train", "2.0", "3.0", "7"], ["`plain`", "extrapolation", "6.0", "7.0", "7"]]
 
 
+def test_sentences_are_compared_with_being_told(script, tmp_path):
+    """On the same tasks; shuffled ones have a line of their own."""
+    scores = lambda x: {"train": [[0.0, x]], "interpolation": [[0.0, x / 2]], "extrapolation": [[0.0, x]]}  # (S, V)
+    found = {"reads": {"returns": scores(0.6), "shuffled": scores(0.1)}, "told": {"returns": scores(0.8)}}
+    for way, result in found.items():
+        (tmp_path / f"{way}.json").write_text(json.dumps(result))
+    cells = [line.strip("| ").split(" | ") for line in script("sentences").table(tmp_path).splitlines()[2:]]
+    assert [line[0] for line in cells] == ["`reads`", "`told`", "`reads, shuffled`"]
+    assert [line[1] for line in cells] == ["0.60, 0.75", "0.80, 1.00", "0.10, 0.12"]
+    assert [line[2] for line in cells] == ["0.30, 0.75", "0.40, 1.00", "0.05, 0.12"]
+
+
 def test_halving_is_compared_on_the_same_trials(script):
     """The rank of what it found among all that went to the end, one that diverged among them; or a refusal."""
     trial = lambda lr, *returns: {"values": {"lr": lr}, "returns": dict(zip("abc", returns, strict=False))}
