@@ -217,6 +217,14 @@ def test_drawn_actions_are_fresh_in_every_step_and_episode():
     assert set(drawn) == {-5, -3, -1, 1, 3, 5} and abs(drawn.mean()) < 4 * np.sqrt(5 / 200)
 
 
+def test_a_recorded_episode_may_be_of_drawn_actions():
+    """Episodes of 200 tasks are of all kinds, as above; without drawing all earn 5."""
+    tasks = tasks_of("one-step", (1.0,) * 200)._replace(horizon=jnp.int32([5] * 200))
+    play = lambda sampled: record(Paid(), Doubtful(), jnp.float32(0), tasks, jnp.int32(8), sampled=sampled)
+    assert np.all(np.asarray(play(False).returns) == 5)
+    assert set(np.asarray(play(True).returns).ravel()) == {-5, -3, -1, 1, 3, 5}
+
+
 def test_an_episode_whose_world_is_lost_keeps_what_it_had():
     """Return and metrics are those of before; others go on."""
     tasks, episodes = tasks_of("one-step", (1.0, -1.0))._replace(horizon=jnp.int32([5, 5])), 12

@@ -43,7 +43,7 @@ from mtjax.types import InputError
 def request(run, **given):
     """What the command asks for; port 0 is any that is free."""
     return SimpleNamespace(
-        **{"run": str(run), "view": 0, "point": 0, "checkpoint": 0, "seed": 0, "drawn": None} | given
+        **{"run": str(run), "view": 0, "point": 0, "checkpoint": 0, "seed": 0, "drawn": None, "sampled": False} | given
     )
 
 

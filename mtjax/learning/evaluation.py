@@ -335,7 +335,7 @@ def keep_states(worlds: Worlds, transition: Transition) -> Any:
     return worlds.state
 
 
-@partial(jax.jit, static_argnums=(0, 1, 5, 6))
+@partial(jax.jit, static_argnums=(0, 1, 5, 6, 7), static_argnames="sampled")
 def record(
     env: Env,
     agent: Agent,
@@ -344,20 +344,23 @@ def record(
     seed: Array,
     trial: int = 1,
     keep: Callable[[Worlds, Transition], Any] = keep_states,
+    sampled: bool = False,
 ) -> Recording:
-    """Play one trial of each task under the mean action.
+    """Play one trial of each task under the mean action, or under drawn ones.
 
     Args:
         state: of the agent, without a leading axis.
         trial: episodes of a trial.
         keep: what to hold of every step, given the worlds after it, before any reset.
+        sampled: draw actions from the policy.
     """
     trials, learners = of_episodes(trial), jax.tree.map(lambda x: x[None], state)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 0xF11), (1, len(tasks.id), 1))
 
     def step(carry: tuple[Worlds, Array], time: Array):
         before, alive = carry
-        worlds, env_step = step_envs(env, agent, learners, tasks, before, None, trials=trials)
+        drawn = _at(keys, -1 - time) if sampled else None
+        worlds, env_step = step_envs(env, agent, learners, tasks, before, drawn, trials=trials)
         now, transition = alive[..., None] & _is_now(before, trial), env_step.transition
         begun = _go_on(env, agent, learners, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
         rewards = jnp.where(now, transition.reward[..., None], 0.0)

@@ -95,6 +95,7 @@ def write(
     seed: int,
     stem: Path,
     named: Mapping[str, str],
+    sampled: bool = False,
 ) -> Path:
     """Film one trial of each chosen task, and write them as one grid. Progress is printed.
 
@@ -106,9 +107,10 @@ def write(
         tasks: all tasks of the environment.
         seconds: how long the film lasts; an episode that ends before stands still.
         named: other names of splits.
+        sampled: draw actions from the policy.
     """
     env = policy.env
-    played, by_name = play(policy, tasks, seed)
+    played, by_name = play(policy, tasks, seed, sampled)
     acting, (chosen, columns) = timeline.timeline_of(env, played, by_name), _episodes(chosen, played)
     width = _width(len(chosen), _WIDTHS)
     count, tiles = max(round(seconds * _FPS), 1), []
@@ -124,14 +126,15 @@ def write(
     return path
 
 
-def play(policy: Policy, tasks: Task, seed: int) -> tuple[Recording, dict[str, Any]]:
+def play(policy: Policy, tasks: Task, seed: int, sampled: bool = False) -> tuple[Recording, dict[str, Any]]:
     """Play one trial of each task, and return it, and the states of each family by its name."""
     env = policy.env
     render.choose_backend()
     with contextlib.ExitStack() as filmed, host.explaining():
         for part in env.parts:
             filmed.enter_context(part.family.filmed())
-        played = record(env, policy.agent, policy.state, tasks, jnp.int32(seed), policy.trial)
+        given = env, policy.agent, policy.state, tasks, jnp.int32(seed), policy.trial
+        played = record(*given, sampled=sampled)
         played = jax.block_until_ready(played)
     return played, {part.name: states for part, states in zip(env.parts, apart(played.kept), strict=True)}
 

@@ -195,7 +195,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(diagnostics.table(policy, found))
         diagnostics.write(policy, found, directory)
     if chosen:
-        films.write(policy, tasks, chosen, request.video_seconds, request.seed, directory / "film", named)
+        place = directory / "film"
+        films.write(policy, tasks, chosen, request.video_seconds, request.seed, place, named, request.sampled)
     print(f"written to {directory}")
 
 

@@ -148,7 +148,7 @@ class Worlds:
 
     def _play(self, newest: str, episode: int) -> tuple[Recording, dict[str, Any]]:
         policy, tasks, _ = self.playing(newest)
-        return films.play(policy, tasks, self.request.seed + episode)
+        return films.play(policy, tasks, self.request.seed + episode, self.request.sampled)
 
 
 def _card(text: str) -> np.ndarray:

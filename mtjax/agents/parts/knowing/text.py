@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +67,7 @@ def _hash(sentences: Sequence[str], learned: int) -> np.ndarray:
     except ImportError:
         raise InputError("text=hashing needs scikit-learn: pip install 'mtjax[text]'") from None
     # New words are left out before words share entries, where they would seem to be others.
-    counts = HashingVectorizer(n_features=_APART, analyzer=_counted).transform(sentences)
+    counts: Any = HashingVectorizer(n_features=_APART, analyzer=_counted).transform(sentences)  # type: ignore
     known = np.unique(counts[:learned].indices)  # columns
     vectors = np.zeros((len(sentences), _SIZE), np.float32)
     np.add.at(vectors.T, known % _SIZE, counts[:, known].toarray().T)
