@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mtjax.types import Env, Spec
+from mtjax.types import Spec
 
 
 class Beginning(NamedTuple):
@@ -15,7 +15,7 @@ class Beginning(NamedTuple):
     tasks: str  # which tasks these are, in words
 
 
-def beginning(agent: Any, other: Any, env: Env) -> Beginning | None:
+def beginning(agent: Any, other: Any, env: Any) -> Beginning | None:
     """Return what ``agent``, or a class of agents, takes of a run of ``other`` on ``env``; None if it takes nothing.
 
     Raises:

@@ -53,9 +53,9 @@ def configured(
     name, family, rest = make_from(env, given)
     starts = start if isinstance(start, tuple) else (start,) if start is not None else ()
     begun = _begun(agent, starts)
-    goes_on = begun is None and len(starts) == 1  # with networks that read contexts
-    if goes_on and isinstance(env, str) and isinstance(family, Family) and isinstance(starts[0].env, Family):
-        family = family.scaled_as(starts[0].env)
+    known = starts[0].env if len(starts) == 1 and begun is None else None  # whose contexts the networks read
+    if isinstance(env, str) and isinstance(family, Family) and isinstance(known, Family):
+        family = family.scaled_as(known)
     of_agent = {key: value for key, value in rest.items() if key not in _names(Settings)}
     _require_known(of_agent, agent, name, family, isinstance(env, str))
     if isinstance(agent, str):

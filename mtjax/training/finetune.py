@@ -80,8 +80,7 @@ def _require_asked(begun: Beginning, env: Env, agent: BaseAgent) -> None:
     given = settings(agent)
     for name, value in {**begun.settings, "tune": "all"}.items():
         if given.get(name) != value:
-            flag = name.replace("_", "-")
-            raise InputError(f"networks of a run of another agent need {flag}={value}, not {given.get(name)}")
+            raise InputError(f"the run's networks need {name.replace('_', '-')}={value}, not {given.get(name)}")
     _require_sizes(begun.spec, env.spec, f"; take {begun.tasks}")
 
 
