@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,11 +51,19 @@ def run_ways(
     part: Callable[[argparse.Namespace, str], Part],
     measure: Callable[[argparse.Namespace, str], None],
     table: Callable[[Path], str],
+    last: Collection[str] = (),
 ) -> None:
-    """Measure a way if this process is its part. Else run all ways that have no result yet, and print the table."""
+    """Measure a way if this process is its part. Else run all ways that have no result yet, and print the table.
+
+    Args:
+        last: ways that need results of others, and begin only once all others are done.
+    """
     if is_part():
         return measure(arguments, arguments.ways[0])
-    left = run_parts(script, [part(arguments, way) for way in arguments.ways], arguments.out, arguments)
+    left: list[str] = []
+    for late in (False, True):
+        ways = [way for way in arguments.ways if (way in last) == late]
+        left = left or run_parts(script, [part(arguments, way) for way in ways], arguments.out, arguments)
     print(table(arguments.out))
     require_all(left)
 

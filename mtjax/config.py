@@ -110,8 +110,9 @@ class RunConfig:
     start: Annotated[str, tyro.conf.arg(name="from")] = ""
     """Folder of a run whose agent is fine-tuned on this environment's tasks. Agent and networks are those of that run;
     learning rates and --tune may be given. Parameters of a single task start from the nearest training task of that
-    run. Seed number k starts from seed k modulo the number of its seeds. With --agent=distil, the run from whose
-    policies a new one learns; RUN,RUN,... are several."""
+    run. Seed number k starts from seed k modulo the number of its seeds. With --agent=options, also a run of sketches,
+    whose sub-policies become options. With --agent=distil, the run from whose policies a new one learns; RUN,RUN,...
+    are several."""
     sweep: tuple[str, ...] = ()
     """Train once for every combination of values, such as agent.actor-lr=1e-4,1e-3 agent.num-experts=2,4. Flags are
     written without their dashes. Real numbers of the agent vary inside one program, beside the seeds. Other settings

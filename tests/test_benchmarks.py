@@ -1,5 +1,6 @@
 """What benchmarks make of their figures; what they measure is no matter of tests."""
 
+import contextlib
 import csv
 import dataclasses
 import importlib.util
@@ -780,6 +781,18 @@ def test_settings_are_words_with_an_equals_sign(script):
         settings_of(["engine=c", "tau"])
     with pytest.raises(InputError, match=r"--grid takes numbers: .*'x'"):
         script("presets").grid(["tau=0.1,x"])
+
+
+@pytest.mark.parametrize("unfinished, begun", [([], [["a"], ["b"]]), (["a"], [["a"]])])
+def test_ways_that_need_others_begin_once_these_are_done(script, tmp_path, monkeypatch, unfinished, begun):
+    """And not at all if one has no result."""
+    parts, stages = script("parts"), []
+    run = lambda script, ways, *_: (stages.append([way.name for way in ways]), unfinished)[1]
+    monkeypatch.setattr(parts, "run_parts", run)
+    arguments, part = SimpleNamespace(ways=["b", "a"], out=tmp_path), lambda arguments, way: parts.Part(way, [])
+    with pytest.raises(SystemExit, match="left: a") if unfinished else contextlib.nullcontext():
+        parts.run_ways("script", arguments, part, lambda *_: None, lambda out: "", last=["b"])
+    assert stages == begun
 
 
 @pytest.mark.parametrize("name", ["compare", "parts", "ppo_peer", "rejax_peer", "scaling"])

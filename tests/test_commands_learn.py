@@ -85,6 +85,8 @@ MARKS: dict[str, Learns | str] = {
     "--env=craft-sketched --agent=sketches --agent.sharing=tasks": _CRAFT,
     "--env=craft-sketched --agent=sketches --agent.sharing=all --agent.conditioning=one-hot": _CRAFT,
     "--env=light-world-sketched --agent=sketches": _CRAFT,
+    "--env=craft --env.vary.goal=bed,axe --split=none --agent=options --agent.endings=stop --agent.keep-options "
+    "--agent.heads=disjoint --agent.conditioning=none --agent.deliberation-cost=0 --from=runs/...": _OTHER,
     "--env=cheetah-run --agent=ppo": _GPU,
     "--env=brax-ant-vary-direction --agent=ppo": _GPU,
     "--env=grid-navi --agent=rl2 --trials=4 --agent.unroll=60": _GRID,

@@ -69,16 +69,23 @@ BASE = (
 
 
 @contextlib.contextmanager
-def named_aims():
-    """Families by name; and programs that compile fast, out of the user's cache."""
+def quick_programs():
+    """Programs that compile fast, out of the user's cache; yields what patches, for families with names."""
     quick = jax.config.read("jax_disable_most_optimizations")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ENVS, "aim", (Aim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
-        patch.setitem(ENVS, "aim-wide", (WideAim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
         patch.setenv("MTJAX_CACHE", "0")
         jax.config.update("jax_disable_most_optimizations", True)
-        yield
+        yield patch
         jax.config.update("jax_disable_most_optimizations", quick)
+
+
+@contextlib.contextmanager
+def named_aims():
+    """Families by name, and programs that compile fast."""
+    with quick_programs() as patch:
+        patch.setitem(ENVS, "aim", (Aim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
+        patch.setitem(ENVS, "aim-wide", (WideAim, {"vary": {"goal": "-1:1:3"}, "split": "none"}))
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

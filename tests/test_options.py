@@ -13,7 +13,7 @@ from test_sketches import Corridor
 import mtjax
 from mtjax.agents import critics, for_action
 from mtjax.agents.fit import learned
-from mtjax.agents.options import NONE, Batch, Running, Taken, choices, ending, of_option
+from mtjax.agents.options import NONE, Batch, Running, Taken, choices, ending, for_actions
 from mtjax.agents.state import of_task
 from mtjax.envs.probes import Probe
 from mtjax.experience.rollouts import windows
@@ -24,7 +24,7 @@ STATES, ACTIONS, OPTIONS, GAMMA, COST = 3, 2, 2, 0.9, 0.07
 SPEC = Spec.vector(STATES, ACTIONS, 1)._replace(action=Discrete(ACTIONS))
 TASKS = tasks_of("one-step", (1.0, -0.5))
 EYE = jnp.eye(STATES)
-LEARNS = ("actor", "termination", "over_options")
+LEARNS = {"learned": ("actor", "termination", "over_options"), "stop": ("actor", "over_options")}
 
 
 def made(spec=SPEC, **settings):
@@ -37,7 +37,9 @@ def begun(agent, spec=SPEC, seed=0):
     state = jax.jit(lambda: agent.init(spec, TASKS, jax.random.key(seed)), compiler_options=QUICK)()
     random = np.random.default_rng(seed)
     noise = lambda x: x + jnp.float32(random.normal(size=x.shape)) * 0.5
-    return state.with_nets(**{name: jax.tree.map(noise, state.nets[name]) for name in (*LEARNS, "critic")})
+    return state.with_nets(
+        **{name: jax.tree.map(noise, state.nets[name]) for name in (*LEARNS[agent.endings], "critic")}
+    )
 
 
 # The three gradients, exactly.
@@ -62,7 +64,7 @@ def tables(agent, nets):
     """The probabilities of actions (S, K, A), of ends (S, K) and of options (S, K) in every state."""
     features = jnp.float32([1.0])
     number = lambda o: jnp.full(STATES, o)
-    outputs = [of_option(agent, nets["actor"], EYE, number(o)) for o in range(OPTIONS)]
+    outputs = [for_actions(agent, nets, EYE, number(o)) for o in range(OPTIONS)]
     ends = [ending(agent, nets, features, EYE, number(o)) for o in range(OPTIONS)]
     over = jax.nn.softmax(choices(agent, nets, features, EYE))
     return jax.nn.softmax(jnp.stack(outputs, axis=1)), jnp.stack(ends, axis=1), over
@@ -117,18 +119,18 @@ def expected_batch(chain, pi, ends, over):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_actors_loss_has_the_gradient_of_the_return_exactly(seed):
-    """Of sub-policies, terminations and the policy over options, with a cost: by a chain's linear equations."""
-    agent, chain = made(entropy_cost=0.0, choice_entropy_cost=0.0), Chain.drawn(seed)
+@pytest.mark.parametrize("endings, seed", [("learned", 0), ("learned", 1), ("stop", 0)])
+def test_the_actors_loss_has_the_gradient_of_the_return_exactly(endings, seed):
+    """Of sub-policies, what ends them and the policy over options, with a cost: by a chain's linear equations."""
+    agent, chain = made(entropy_cost=0.0, choice_entropy_cost=0.0, endings=endings), Chain.drawn(seed)
     nets = of_task(begun(agent, seed=seed).nets, 0)
     of_learned = lambda learns: nets | learns
     earned = lambda learns: chain.first @ solved(chain, *tables(agent, of_learned(learns)))[1]
-    learns = {name: nets[name] for name in LEARNS}
+    learns = {name: nets[name] for name in LEARNS[endings]}
     batch = expected_batch(chain, *tables(agent, nets))
     loss = lambda learns: agent.actor_loss(of_learned(learns), batch, jax.random.key(0))[0]
     exact, found = (jax.jit(jax.grad(f), compiler_options=QUICK)(learns) for f in (earned, loss))
-    for name in LEARNS:
+    for name in learns:
         for ours, theirs in zip(jax.tree.leaves(found[name]), jax.tree.leaves(exact[name]), strict=True):
             assert np.any(np.abs(theirs) > 1e-4)
             np.testing.assert_allclose(-ours, theirs, rtol=2e-3, atol=2e-5)
@@ -247,6 +249,35 @@ def test_an_option_runs_on_until_it_ends_and_ratios_are_one():
     assert 5 < kept < 55
 
 
+def test_stop_ends_an_option_and_the_other_outputs_say_what_it_does():
+    """By hand: with outputs ln 1, ln 2 and ln 3 it ends with 3 in 6, and draws 1 to 2; without action 0, 3 in 5."""
+    agent = made(endings="stop")
+    state, task = begun(agent), pick(TASKS, 0)
+    head = {"kernel": jnp.zeros((OPTIONS, 16, 3)), "bias": jnp.log(jnp.float32([[1, 2, 3], [1, 1, 2]]))}
+    actor = state.nets["actor"]
+    state = state.with_nets(actor=actor._replace(shared=actor.shared | {"head": head}))
+    assert "termination" not in state.nets and learned(agent.fits.values())[-2:] == LEARNS["stop"]
+    nets, before = of_task(state.nets, 0), jnp.int32([0, 1, 0])
+    np.testing.assert_allclose(ending(agent, nets, TASKS.context[0], EYE, before), [0.5, 0.5, 0.5], rtol=1e-6)
+    masked = ending(agent, nets, TASKS.context[0], EYE, before, jnp.float32([0, 1]))
+    np.testing.assert_allclose(masked, [3 / 5, 2 / 3, 3 / 5], rtol=1e-6)
+    memory = agent.begin(state, task)._replace(running=Running(jnp.int32(0), jnp.float32(1)))
+    act = jax.jit(lambda key: agent.act(state, memory, EYE[0], task, key), compiler_options=QUICK)
+    found = [act(jax.random.key(seed)) for seed in range(200)]
+    kept = [x for x in found if not x.extras.chosen]
+    assert 70 < len(kept) < 130 and all(x.extras.now == (0, 0.5) for x in kept)
+    np.testing.assert_allclose(np.exp(kept[0].outputs), [1, 2], rtol=1e-6)
+    for acted in kept:
+        assert float(acted.extras.log_prob) == pytest.approx(np.log([1 / 3, 2 / 3][int(acted.action)]), abs=1e-5)
+
+
+def test_options_begin_to_end_by_stop_as_often_as_by_terminations():
+    agent = made(endings="stop", end_bias=-1.0)
+    state = jax.jit(lambda: agent.init(SPEC, TASKS, jax.random.key(0)), compiler_options=QUICK)()
+    ends = ending(agent, of_task(state.nets, 0), TASKS.context[0], EYE, jnp.int32([0, 1, 0]))
+    np.testing.assert_allclose(ends, jax.nn.sigmoid(-1.0), atol=0.01)
+
+
 @pytest.mark.parametrize("bias, length", [(-2.0, 6), (0.1, 1), (-1.0, 3)])
 def test_without_a_key_an_option_lasts_as_long_as_it_would_with_probability_one_half(bias, length):
     """(1 - sigmoid(bias))^n falls below one half at the n-th step: there the next is chosen."""
@@ -303,16 +334,18 @@ def test_two_tasks_are_learned_and_a_cost_makes_options_last():
 
 
 @pytest.mark.slow
-def test_options_that_are_kept_stay_as_they_are():
+@pytest.mark.parametrize("endings", LEARNS)
+def test_options_that_are_kept_stay_as_they_are(endings):
     """Bit for bit, while the policy over them and the critic learn."""
     small = {**GIVEN, "num_envs": 4, "unroll": 8, "minibatches": 2, "epochs": 1, "chunk_steps": 8}
-    agent = made(CORRIDOR.spec, keep_options=True)
+    agent = made(CORRIDOR.spec, keep_options=True, endings=endings)
     assert learned(agent.fits.values()) == ("critic", "representation", "knowing", "over_options")
     start, after = (only_seed(train(CORRIDOR, agent, small, chunks=n)[0].agent.nets) for n in (0, 1))
     moved = lambda name: any(
         np.any(x != y) for x, y in zip(*(jax.tree.leaves(nets[name]) for nets in (start, after)), strict=True)
     )
-    assert [moved(name) for name in (*LEARNS, "critic")] == [False, False, True, True]
+    *kept, choice = LEARNS[endings]
+    assert not any(map(moved, kept)) and moved(choice) and moved("critic")
 
 
 @pytest.mark.slow
@@ -339,8 +372,14 @@ def test_probes_have_their_known_values_under_every_option(kind):
         ({"representation": "deepmdp"}, "use representation=plain"),
         ({"encoder": "care"}, "options do not see the task, by which this encoder works"),
         ({"encoder": "input-map"}, "and another encoder"),
+        ({"endings": "never"}, "unknown endings 'never'"),
     ],
 )
 def test_what_makes_no_sense_is_refused(given, said):
     with pytest.raises(InputError, match=said):
         mtjax.agent("options", **given)
+
+
+def test_stop_is_no_choice_beside_continuous_actions():
+    with pytest.raises(InputError, match="use endings=learned"):
+        mtjax.agent("options", endings="stop").init(Spec.vector(3, 2, 1), TASKS, jax.random.key(0))

@@ -2,8 +2,9 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import tyro
 
 from mtjax.agents import combinations, parts
+from mtjax.agents.beginning import Beginning
 from mtjax.agents.fit import Fit, Losses
 from mtjax.agents.hyperparameters import FLAT, PARTS, kinds_of
 from mtjax.agents.networks import Network, Params
@@ -121,6 +123,8 @@ class BaseAgent(abc.ABC):
     """What keeps the networks able to learn."""
     taught: ClassVar[bool] = False
     """Whether it learns from the policies of other runs, which --from names, instead of going on with theirs."""
+    begins_from: ClassVar[Mapping[type, Callable[[Any, Spec], Beginning]]] = MappingProxyType({})
+    """The other classes of agents from whose runs it can begin, each with what it takes of one, given its spec."""
     distils: ClassVar[bool] = False
     """Whether another policy than each task's own learns beside it."""
     num_critics: ClassVar[int] = 0

@@ -86,6 +86,8 @@ class OnPolicy(BaseAgent):
     devices_differ: ClassVar[bool] = True
     critic_outputs: ClassVar[int] = 1
     """The number of values that the critic gives a state."""
+    extra_outputs: ClassVar[int] = 0
+    """The number of outputs that the actor has after those of its policy."""
     actor_lr: float = 3e-4
     """Adam's learning rate for the actor."""
     critic_lr: float = 1e-3
@@ -156,7 +158,8 @@ class OnPolicy(BaseAgent):
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
         (actor_key, critic_key), num_tasks, size = jax.random.split(key), state.num_tasks, len(inputs.action)
-        count, first = self.policy.outputs(size), self.policy.first(size, self.initial_std)
+        count, extra = self.policy.outputs(size) + self.extra_outputs, jnp.zeros(self.extra_outputs)
+        first = jnp.append(self.policy.first(size, self.initial_std), extra)
         actor = scale_head(self.actor.init(actor_key, num_tasks, count, *inputs.actor), first)
         values = self.critic_outputs
         critic = scale_head(self.critic.init(critic_key, num_tasks, values, *inputs.critic), jnp.zeros(values))

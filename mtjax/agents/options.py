@@ -2,20 +2,24 @@
 
 import dataclasses
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mtjax.agents import clipped_ratio, critics, parts
 from mtjax.agents.base import Inputs, Memory, network_of
+from mtjax.agents.beginning import Beginning
 from mtjax.agents.fit import Fit
+from mtjax.agents.hyperparameters import settings
 from mtjax.agents.networks import Network
 from mtjax.agents.on_policy import ActorAux, OnPolicy, limited, scale_head
-from mtjax.agents.sketches import SubPolicies, with_lengths
+from mtjax.agents.parts.policies.categorical import allowed
+from mtjax.agents.sketches import Sketches, SubPolicies, lean_to_stop, with_lengths
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience.rollouts import played, windows
-from mtjax.types import Acted, Array, InputError, Key, Metrics, Spec, Task, Transition
+from mtjax.types import Acted, Array, Discrete, InputError, Key, Metrics, Spec, Task, Transition
 
 NONE = -1
 """The number of the option that runs before the first one."""
@@ -65,6 +69,26 @@ class Values(NamedTuple):
     state: Array  # (...) V(s)
 
 
+def sub_policies(sketches: Sketches, spec: Spec) -> Beginning:
+    """Return what options take of a run of sketches: the sub-policies of its symbols, for tasks without a sketch.
+
+    Raises:
+        InputError: it has no policies of symbols alone.
+    """
+    had, of_networks = settings(sketches), ("hidden", "actor_hidden", "actor_layer_norm", "encoder")
+    for name, value in {"sharing": "symbols", "conditioning": "none"}.items():
+        if had[name] != value:
+            raise InputError(
+                f"options begin from policies of symbols alone, and this run of sketches has {name}={had[name]}; take "
+                f"one with {name}={value}"
+            )
+    asked = {name: had[name] for name in (*of_networks, *parts.setting_names(sketches.encoder))}
+    asked |= {"endings": "stop", "num_options": spec.symbols, "normalize_observations": False}
+    seen = jax.ShapeDtypeStruct((spec.obs_size - spec.symbols,), spec.obs.dtype)
+    without = spec._replace(obs=seen, action=Discrete(spec.action_size - 1), symbols=0)
+    return Beginning(("actor",), asked, without, "tasks of that world that follow no sketch, such as --env=craft")
+
+
 @dataclasses.dataclass(frozen=True)
 class Options(OnPolicy):
     """Options learn what the parts of tasks are: the option-critic (Bacon et al. 2017), by clipped steps.
@@ -89,6 +113,13 @@ class Options(OnPolicy):
 
     Without a key, so in evaluation, an option ends once it would have ended with a probability of one half.
 
+    With ``endings=stop`` there are no terminations. A sub-policy has one output more, STOP, as those of ``sketches``
+    have. Its outputs z_o(s) say both what it does and where it ends:
+        beta_o(s) = softmax(z_o(s))_STOP,    pi_o(a|s) = softmax(z_o(s))_a / (1 - beta_o(s))
+    Such options can begin from a run of ``sketches``, by ``--from``. Then option k is the sub-policy of symbol k, and a
+    new task is learned without its sketch, with ``keep_options`` by choosing among the sub-policies alone (Andreas et
+    al. 2017, adaptation). The policy over options and the critic begin anew.
+
     Differs from Bacon et al.: the policy over options is a softmax that learns, where there it is epsilon-greedy in Q;
     clipped steps over several epochs on advantages of whole rollouts replace single steps on one-step targets;
     networks share no layers. Tasks share options, where there one option-critic learns one task after another.
@@ -100,6 +131,7 @@ class Options(OnPolicy):
     )
     goes_on: ClassVar[bool] = True
     stand_in: ClassVar[str] = "each is played by the options that all tasks share"
+    begins_from: ClassVar = MappingProxyType({Sketches: sub_policies})
     takes: ClassVar[str] = "observations of any tree of numbers and bools as one vector"
     hidden: tuple[int, ...] = (128,)
     actor_lr: float = 1e-3
@@ -112,6 +144,8 @@ class Options(OnPolicy):
     """Number of options (K)."""
     deliberation_cost: float = 0.01
     """What ending an option costs, in units of reward (c)."""
+    endings: Literal["learned", "stop"] = "learned"
+    """What ends an option: a termination of its own (learned), or a last output of its sub-policy (stop)."""
     choice_entropy_cost: float = 1e-2
     """Weight of the entropy of the policy over options in the actor loss, where it chooses."""
     end_bias: float = -2.0
@@ -135,7 +169,7 @@ class Options(OnPolicy):
 
     @property
     def actor(self) -> Network:
-        """The sub-policies, and their terminations: a network for each option."""
+        """The sub-policies, and their terminations if they have any: a network for each option."""
         return super().actor.as_kind(SubPolicies, own=(), count=self.num_options)
 
     @property
@@ -143,8 +177,15 @@ class Options(OnPolicy):
         """The number of values of a state: one for each option."""
         return self.num_options
 
+    @property
+    def extra_outputs(self) -> int:  # type: ignore[override]
+        """The number of outputs of sub-policies beside those for actions: STOP, if it ends them."""
+        return int(self.endings == "stop")
+
     def init(self, spec: Spec, tasks: Task, key: Key) -> AgentState:
         """Return the initial state. A curriculum by length gets to know the lengths of sketches, if tasks have any."""
+        if self.endings == "stop" and not isinstance(spec.action, Discrete):
+            raise InputError("endings=stop is one choice more beside discrete actions; use endings=learned")
         return with_lengths(self, super().init(spec, tasks, key), tasks)
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
@@ -152,17 +193,19 @@ class Options(OnPolicy):
         of_options = inputs._replace(actor=(jnp.zeros(0), due))
         state = super().init_networks(state, of_options, key)
         end_key, choice_key = jax.random.split(jax.random.fold_in(key, 1))
-        end = self.actor.init(end_key, state.num_tasks, 1, *of_options.actor)
         choice = chooser(self).init(choice_key, state.num_tasks, self.num_options, *inputs.actor)
-        return state.with_nets(
-            termination=scale_head(end, jnp.full(1, self.end_bias)),
-            over_options=scale_head(choice, jnp.zeros(self.num_options)),
-        )
+        state = state.with_nets(over_options=scale_head(choice, jnp.zeros(self.num_options)))
+        if self.endings == "stop":
+            among = jnp.log(self.policy.outputs(len(inputs.action)))  # as likely as all actions together with bias 0
+            return state.with_nets(actor=lean_to_stop(state.nets["actor"], among + self.end_bias))
+        end = self.actor.init(end_key, state.num_tasks, 1, *of_options.actor)
+        return state.with_nets(termination=scale_head(end, jnp.full(1, self.end_bias)))
 
     @property
     def fits(self) -> dict[str, Fit]:
         found = super().fits
-        names = (*found["actor"].names, "termination", "over_options")
+        terminations = () if self.endings == "stop" else ("termination",)
+        names = (*found["actor"].names, *terminations, "over_options")
         kept = {"actor", "termination"} if self.keep_options else set()
         learns = tuple(name for name in names if name not in kept)
         return found | {"actor": dataclasses.replace(found["actor"], names=learns)}
@@ -178,13 +221,13 @@ class Options(OnPolicy):
         features, seen = self.view.actor_inputs(nets, *view)
         end_key, choice_key, action_key = (None,) * 3 if key is None else jax.random.split(key, 3)
         before, lasted = memory.running
-        ends = jax.nn.sigmoid(of_option(self, nets["termination"], seen, before)[..., 0])
+        ends = ends_of(self, nets, seen, before, task.action_mask)
         lasts = lasted * (1 - ends)
         chosen = (before == NONE) | (lasts < 0.5 if end_key is None else jax.random.bernoulli(end_key, ends))
         logs = jax.nn.log_softmax(chooser(self).apply(nets["over_options"], features, seen))
         drawn = jnp.argmax(logs) if choice_key is None else jax.random.categorical(choice_key, logs)
         option = jnp.where(chosen, drawn, before).astype(jnp.int32)
-        outputs = of_option(self, nets["actor"], seen, option)
+        outputs = for_actions(self, nets, seen, option)
         action, raw, log_prob = self.policy.draw(outputs, task.action_mask, action_key)
         now = Running(option, jnp.where(chosen, 1.0, lasts))
         return Acted(action, Taken(raw, log_prob, before, now, chosen, at_option(logs, option)), outputs)
@@ -202,7 +245,8 @@ class Options(OnPolicy):
         flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
         taken, of_tasks = flat.extras, partial(known_of, self, state)
         here, then = of_tasks(features, obs), of_tasks(features, next_obs)
-        ends = over_tasks(partial(ending, self), state.nets, features, next_obs, taken.now.option)
+        there = features, next_obs, taken.now.option, tasks.action_mask
+        ends = over_tasks(partial(ending, self), state.nets, *there)
         upon = arrival(then, taken.now.option, ends, self.deliberation_cost)
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
         of_option, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
@@ -231,7 +275,7 @@ class Options(OnPolicy):
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:  # type: ignore[override]
         _, seen = self.view.actor_inputs(nets, batch.features, batch.obs)
-        outputs = of_option(self, nets["actor"], seen, batch.option)
+        outputs = for_actions(self, nets, seen, batch.option)
         log_ratio = limited(self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob)
         gain, metrics = clipped_ratio.gain(self, log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
@@ -241,7 +285,7 @@ class Options(OnPolicy):
         choice, _ = clipped_ratio.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
 
-        ends = ending(self, nets, batch.features, batch.obs, batch.before)
+        ends = ends_of(self, nets, seen, batch.before, batch.mask)
         runs = batch.before != NONE
         loss = (
             jnp.mean(runs * ends * batch.end_loss)
@@ -292,6 +336,20 @@ def of_option(agent: Any, net: Any, seen: Array, option: Array) -> Array:
     return agent.actor.apply(net, jnp.zeros(0), with_due(seen, option, agent.num_options))
 
 
+def for_actions(agent: Any, nets: Nets, seen: Array, option: Array) -> Array:
+    """Return those outputs (..., P) of sub-policies for inputs (..., O) that the policy reads: all but STOP."""
+    outputs = of_option(agent, nets["actor"], seen, option)
+    return outputs[..., :-1] if agent.endings == "stop" else outputs
+
+
+def ends_of(agent: Any, nets: Nets, seen: Array, option: Array, mask: Array | None) -> Array:
+    """Return the probabilities (...) with which options (...) end for inputs (..., O); any number for no option."""
+    if agent.endings == "learned":
+        return jax.nn.sigmoid(of_option(agent, nets["termination"], seen, option)[..., 0])
+    outputs = of_option(agent, nets["actor"], seen, option)
+    return jax.nn.sigmoid(outputs[..., -1] - jax.nn.logsumexp(allowed(outputs[..., :-1], mask), axis=-1))
+
+
 def known_of(agent: Any, state: AgentState, features: Array, obs: Any) -> Values:
     """Return the values of observations (T, B, ...) in units of reward."""
     q = critics.values(agent, state, features, obs)
@@ -304,7 +362,7 @@ def choices(agent: Any, nets: Nets, features: Array, obs: Any) -> Array:
     return chooser(agent).apply(nets["over_options"], *agent.view.actor_inputs(nets, features, obs))
 
 
-def ending(agent: Any, nets: Nets, features: Array, obs: Any, option: Array) -> Array:
-    """Return the probabilities (B,) with which options (B,) end; one half for no option."""
+def ending(agent: Any, nets: Nets, features: Array, obs: Any, option: Array, mask: Array | None = None) -> Array:
+    """Return the probabilities (B,) with which options (B,) end; any number for no option."""
     _, seen = agent.view.actor_inputs(nets, features, obs)
-    return jax.nn.sigmoid(of_option(agent, nets["termination"], seen, option)[..., 0])
+    return ends_of(agent, nets, seen, option, mask)

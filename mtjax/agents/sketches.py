@@ -122,8 +122,7 @@ class Sketches(OnPolicy):
 
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
         state = super().init_networks(state, inputs, key)
-        lean = lambda head: head | {"bias": head["bias"].at[..., -1].add(self.stop_bias)}  # of STOP, which is last
-        return state.with_nets(actor=with_head(state.nets["actor"], lean))
+        return state.with_nets(actor=lean_to_stop(state.nets["actor"], self.stop_bias))
 
     # Learning, as PPO does.
 
@@ -132,6 +131,11 @@ class Sketches(OnPolicy):
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         return clipped_ratio.assess(self, state, steps, tasks)
+
+
+def lean_to_stop(actor: Params, bias: float | Array) -> Params:
+    """Return sub-policies with a bias added to the logit of STOP, which is their last output."""
+    return with_head(actor, lambda head: head | {"bias": head["bias"].at[..., -1].add(bias)})
 
 
 def with_lengths(agent: Any, state: AgentState, tasks: Task) -> AgentState:

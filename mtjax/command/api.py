@@ -83,8 +83,8 @@ def train(
         settings: settings of the training loop; by default the preset's for a name, else ``Settings()``.
         start: the policy to fine-tune, from ``mtjax.load``, or the folder of its run. A family that is given as an
             object is ``new.scaled_as(start.env)``, and the agent ``start.agent``; only learning rates and ``tune`` may
-            differ. ``finetune.adopt`` says what is kept. For the agent distil, the policies or runs that teach it: one,
-            or a list.
+            differ. ``finetune.adopt`` says what is kept. For the agent options, also a policy of sketches, whose
+            sub-policies become options. For the agent distil, the policies or runs that teach it: one, or a list.
         sweep: numbers of the agent that vary inside one program. Give ``{"actor_lr": [1e-4, 1e-3], "gamma": [0.98,
             0.99]}`` for every combination, or a list of points ``{"actor_lr": 1e-4, "gamma": 0.98}``. Every point has
             all seeds, and the S axis of the result holds them point by point. A seed whose numbers stop being finite

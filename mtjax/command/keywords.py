@@ -6,6 +6,7 @@ from typing import Any
 
 from mtjax import agents
 from mtjax.agents import BaseAgent, parts, swept
+from mtjax.agents.beginning import Beginning, beginning
 from mtjax.agents.hyperparameters import PARTS, unknown_setting
 from mtjax.agents.hyperparameters import settings as settings_of
 from mtjax.agents.swept import Sweep
@@ -51,12 +52,14 @@ def configured(
         raise InputError(f"settings is a mtjax.Settings, not {_kind(settings)}; single settings are given by name")
     name, family, rest = make_from(env, given)
     starts = start if isinstance(start, tuple) else (start,) if start is not None else ()
-    if len(starts) == 1 and isinstance(env, str) and isinstance(family, Family) and isinstance(starts[0].env, Family):
-        family = family.scaled_as(starts[0].env)
+    begun = _begun(agent, starts)
+    known = starts[0].env if len(starts) == 1 and begun is None else None  # whose contexts the networks read
+    if isinstance(env, str) and isinstance(family, Family) and isinstance(known, Family):
+        family = family.scaled_as(known)
     of_agent = {key: value for key, value in rest.items() if key not in _names(Settings)}
     _require_known(of_agent, agent, name, family, isinstance(env, str))
     if isinstance(agent, str):
-        config = with_preset(name, agent, "auto", of_agent, family)
+        config = with_preset(name, agent, "auto", {**(begun.settings if begun else {}), **of_agent}, family)
         training = dataclasses.replace(settings or config.training, **{x: rest[x] for x in rest.keys() - of_agent})
         length = dataclasses.replace(config.plan if isinstance(env, str) else Plan(), **plan)
         chosen = {x for x in plan if plan[x] != getattr(Plan, x)} | {*given, *(_names(Settings) if settings else ())}
@@ -74,6 +77,13 @@ def configured(
         sweep=swept.words(config.learner, points),
         **written,
     )
+
+
+def _begun(agent: Any, starts: Sequence[Policy]) -> Beginning | None:
+    """Return what an agent takes of the run of another one, if it begins from such a run."""
+    if len(starts) != 1 or not isinstance(agent, str | BaseAgent):
+        return None
+    return beginning(agents.preset_of(agent).cls if isinstance(agent, str) else agent, starts[0].agent, starts[0].env)
 
 
 def _teacher(starts: Sequence[Policy]) -> dict[str, Any]:

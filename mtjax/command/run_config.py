@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mtjax.agents import preset_of, settings
+from mtjax.agents.beginning import beginning
 from mtjax.agents.hyperparameters import CHOICES, flag_names, owners
 from mtjax.command.class_sources import all_flags
 from mtjax.command.flags import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags, with_port
@@ -63,11 +64,13 @@ def draft(argv: Sequence[str]) -> RunConfig:
     deciding: dict[str, Any] = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
     if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse
         deciding["normalize_observations"] = False
-    default = with_preset(env_name, agent_name, preset_name, {**chosen, **deciding}, vary=vary, **of_family)
-    if sources:
+    begun = beginning(preset_of(agent_name).cls, sources[0].learner, sources[0].family) if sources else None
+    asked = {} if begun is None else begun.settings
+    default = with_preset(env_name, agent_name, preset_name, {**asked, **chosen, **deciding}, vary=vary, **of_family)
+    if sources and begun is None:
         taught = preset_of(agent_name).cls.taught
         default = _distilling(default, sources) if taught else _fine_tuning(default, sources[0], chosen)
-        default = dataclasses.replace(default, start=start)
+    default = dataclasses.replace(default, start=start)
     _check_flags(argv, default)
     config = parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
     config = fit_length(config, {name for word in argv if (name := _name(word))})

@@ -1,5 +1,6 @@
 """Fine-tuning: an agent starts on new tasks from the parameters that a run learned on other tasks."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.agents import BaseAgent, parts, settings
+from mtjax.agents.beginning import Beginning, beginning
 from mtjax.agents.state import AgentState, of_tasks
 from mtjax.agents.swept import agents_at
 from mtjax.config import NO_FINE_TUNING, RunConfig
@@ -40,29 +42,46 @@ def require_start(config: RunConfig, start: Policy | None) -> None:
 
 
 def require_fit(start: Policy, env: Env, agent: BaseAgent) -> None:
-    """Check that an agent can fine-tune a run's networks on the tasks of ``env``.
+    """Check that an agent can fine-tune a run's networks on the tasks of ``env``, or begin from those that it takes.
 
     Raises:
         InputError: the agent differs from the run's, the tasks have other sizes or another context, or the policy comes
             with the package.
     """
     pretrained.require_learning(start.directory)
+    begun = beginning(agent, start.agent, start.env)
+    if begun is not None:
+        return _require_asked(begun, env, agent)
     require_same_agent(start.agent, agent)
     for each in (env, start.env):
         require_family(each, NO_FINE_TUNING)
     family, known = env, start.env
     theirs, ours = known.spec, family.spec
-    if frames.seen(theirs) != frames.seen(ours) or theirs.action != ours.action:
-        pictures = frames.shown(theirs.obs) or frames.shown(ours.obs)
-        fix = "; give --env.pixels, --env.frames, --env.grey and --env.state as the run has them" * pictures
-        raise InputError(
-            f"the run's networks map {describe_sizes(theirs)} to {describe_actions(theirs)}; "
-            f"the new tasks have {describe_sizes(ours)} and {describe_actions(ours)}{fix}"
-        )
+    pictures = frames.shown(theirs.obs) or frames.shown(ours.obs)
+    fix = "; give --env.pixels, --env.frames, --env.grey and --env.state as the run has them" * pictures
+    _require_sizes(theirs, ours, fix)
     alike = not isinstance(family, Family) or not isinstance(known, Family) or ranges(family) == ranges(known)
     if theirs.context_size != ours.context_size or not alike:
         raise InputError("the context of these tasks is not written as the run's; give env.scaled_as(policy.env)")
     _require_numbers(start, env, agent)
+
+
+def _require_sizes(theirs: Spec, ours: Spec, fix: str) -> None:
+    """Refuse new tasks whose observations or actions have other sizes than those of a run's networks."""
+    if frames.seen(theirs) != frames.seen(ours) or theirs.action != ours.action:
+        raise InputError(
+            f"the run's networks map {describe_sizes(theirs)} to {describe_actions(theirs)}; "
+            f"the new tasks have {describe_sizes(ours)} and {describe_actions(ours)}{fix}"
+        )
+
+
+def _require_asked(begun: Beginning, env: Env, agent: BaseAgent) -> None:
+    """Refuse an agent or tasks unlike those that the networks ask for which it takes of another agent's run."""
+    given = settings(agent)
+    for name, value in {**begun.settings, "tune": "all"}.items():
+        if given.get(name) != value:
+            raise InputError(f"the run's networks need {name.replace('_', '-')}={value}, not {given.get(name)}")
+    _require_sizes(begun.spec, env.spec, f"; take {begun.tasks}")
 
 
 def require_same_agent(old: BaseAgent, agent: BaseAgent) -> None:
@@ -116,12 +135,16 @@ def adopt(start: Policy, agent: BaseAgent, tasks: Task, fresh: Any) -> Any:
     and the memories of gradient surgery and samplers stay fresh. Seed number k starts from the run's seed k modulo
     the number of its seeds.
 
+    A run of another agent gives the networks that ``beginning`` names, and nothing else.
+
     Raises:
         InputError: the shapes of the networks differ.
     """
+    begun = beginning(agent, start.agent, start.env)
+    put = partial(_adopt, tasks) if begun is None else partial(_take, begun.nets)
     seeds = jnp.arange(len(jax.tree.leaves(fresh)[0])) % len(start.seeds)
     of_seeds = lambda states: jax.tree.map(lambda x: x[seeds], states)
-    adopt_all = lambda states, fresh: jax.vmap(partial(_adopt, agent, tasks))(of_seeds(states), fresh)
+    adopt_all = lambda states, fresh: jax.vmap(put)(of_seeds(states), fresh)
     state = jax.jit(adopt_all)(start.states, fresh)
     require_shapes("run", state, fresh)
     return state
@@ -136,7 +159,11 @@ def require_shapes(whose: str, networks: Any, fresh: Any) -> None:
             raise InputError(f"the {whose}'s networks do not fit: {name} is {ours.shape[1:]}, not {expected.shape[1:]}")
 
 
-def _adopt(agent: BaseAgent, tasks: Task, old: AgentState, fresh: AgentState) -> AgentState:
+def _take(names: Sequence[str], old: AgentState, fresh: AgentState) -> AgentState:
+    return fresh.with_nets(**{name: old.nets[name] for name in names})
+
+
+def _adopt(tasks: Task, old: AgentState, fresh: AgentState) -> AgentState:
     nets, slow = of_tasks((old.nets, old.slow), old.nearest(tasks))
     nets = {name: net for name, net in nets.items() if name not in _FRESH}
     return fresh._replace(nets=fresh.nets | nets, slow=fresh.slow | slow)
