@@ -72,7 +72,7 @@ MARKS: dict[str, Learns | str] = {
     "--curriculum=sequence:100000 --chunk-steps=10000 --agent.plasticity=continual-backprop": _WALKER,
     "--env=cw10 --agent=brc --agent.conditioning=one-hot --agent.heads=per-task --num-envs=256 "
     "--curriculum=sequence:3000 --chunk-steps=750 --steps=7680000 --agent.continual=clone": _GPU,
-    "--env=errands --agent=ppo --agent.conditioning=text": _READS,
+    "--env=errands --agent=ppo --agent.conditioning=text --agent.encoder=film": _READS,
     "--env=bandit --agent=pqn": _SOON,
     "--env=gymnasium:CartPole-v1 --agent=ppo": _GYM,
     "--env=gymnax:Breakout-MinAtar --agent=pqn": "needs gymnax; tests/test_pqn.py has probes",

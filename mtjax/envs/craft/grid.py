@@ -204,8 +204,8 @@ def surroundings(world: Grid) -> tuple[Array, Array]:
     sets = jnp.where(world.things == EMPTY, 0, 1 << jnp.maximum(world.things - 1, 0))  # of kinds, a bit for each
     around = jax.lax.dynamic_slice(jnp.pad(sets, reach), world.place, 2 * [_BLOCK * wide])
     near = around[reach - _NEAR : reach + _NEAR + 1, reach - _NEAR : reach + _NEAR + 1]
-    columns = reduce(operator.or_, jnp.moveaxis(around.reshape(wide, _BLOCK, -1), 1, 0))
-    far = reduce(operator.or_, jnp.moveaxis(columns.reshape(wide, wide, _BLOCK), 2, 0))
+    blocks = jnp.moveaxis(around.reshape(wide, _BLOCK, wide, _BLOCK), (1, 3), (0, 1))
+    far = reduce(operator.or_, blocks.reshape(-1, wide, wide))
     members = lambda sets: (sets[..., None] >> np.arange(len(KINDS) - 1) & 1).astype(jnp.float32)
     return members(near), members(far)
 
