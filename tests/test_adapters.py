@@ -240,6 +240,20 @@ def test_packages_that_are_missing_are_named_with_the_command(monkeypatch):
 
 
 @needs("gymnax")
+def test_scales_multiply_the_rewards_of_games():
+    """And nothing else: the same actions lead to the same observations, and to scaled rewards."""
+    family = mtjax.make("gymnax:Breakout-MinAtar", vary={"reward-scale": "0.01,1,100"}, split="none")
+    tasks, nothing = family.tasks("train"), lambda state, action: ()
+    each = [play(family, jax.tree.map(lambda x, row=row: x[row], tasks), nothing)[0] for row in range(3)]
+    (small, *_), (plain, *_), (large, *_) = each
+    np.testing.assert_array_equal(small, plain)
+    np.testing.assert_array_equal(large, plain)
+    small, plain, large = (rewards for _, rewards, *_ in each)
+    assert plain.max() == 1
+    np.testing.assert_allclose([small, large], [0.01 * plain, 100 * plain], rtol=1e-6)
+
+
+@needs("gymnax")
 def test_mistakes_are_told():
     """Unknown names and parameters, with the nearest of the package."""
     with pytest.raises(InputError, match="did you mean 'CartPole-v1'"):

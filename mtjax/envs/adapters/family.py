@@ -12,11 +12,12 @@ import jax.numpy as jnp
 
 from mtjax.envs.choosing import Acting
 from mtjax.envs.family import Family
-from mtjax.envs.parameters import Parameter
+from mtjax.envs.parameters import REWARD_SCALE, Parameter
 from mtjax.frames import shown
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _MOST_STEPS = 1_000_000
+_SCALE = "reward-scale"
 
 
 class AdaptedState(NamedTuple):
@@ -102,8 +103,9 @@ class Adapted(Acting, Family):
 
     @cached_property
     def every_parameter(self) -> Mapping[str, Parameter]:  # type: ignore[override]
-        """Return the parameters that can vary."""
-        return {name.replace("_", "-"): Parameter("1", float(x)) for name, x in self.defaults.items()}
+        """Return the parameters that can vary: the package's own, and a factor of the reward."""
+        own = {name.replace("_", "-"): Parameter("1", float(x)) for name, x in self.defaults.items()}
+        return own | {_SCALE: REWARD_SCALE}
 
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode of ``task`` in a fresh random state."""
@@ -114,13 +116,15 @@ class Adapted(Acting, Family):
 
     def step(self, task: Task, state: AdaptedState, action: Array) -> Step:
         """Advance one step under ``action``; observation and reward are those after it."""
-        world, *outcome = self.advance(task, state.world, action, state.step_key)
-        return _strong_step(state._replace(world=world, steps=state.steps + 1), *outcome)
+        world, obs, reward, *ends = self.advance(task, state.world, action, state.step_key)
+        reward = reward * task.params.get(_SCALE, 1.0)
+        return _strong_step(state._replace(world=world, steps=state.steps + 1), obs, reward, *ends)
 
     def own_params(self, task: Task) -> Any:
         """Return the package's parameters of a task, in the package's types."""
         names, nominal = {name.replace("_", "-"): name for name in self.defaults}, self.defaults
-        own = {names[name]: _as_default(nominal[names[name]], value) for name, value in task.params.items()}
+        given = {name: value for name, value in task.params.items() if name in names}
+        own = {names[name]: _as_default(nominal[names[name]], value) for name, value in given.items()}
         return self.original[1].replace(**own)
 
     @property

@@ -23,7 +23,7 @@ class Gymnax(Adapted):
 
     Parameters that can vary: all numbers of the environment's EnvParams, such as CartPole's length. What gymnax has as
         a number of its own does not follow from others: CartPole's polemass_length and total_mass stay where length and
-        masspole vary, unless they vary too (--env.combine=paired).
+        masspole vary, unless they vary too (--env.combine=paired). And reward-scale, a factor of the reward.
     """
 
     environment: str = "CartPole-v1"
