@@ -1,14 +1,13 @@
 """Measure what scales of rewards do: tasks whose rewards differ by .01, 1 and 100, with and without PopArt.
 
-    python benchmarks/scales.py goals|tables|game [--agents NAME ...] [--seeds 10] [--steps N] [--evaluations 10]
+    python benchmarks/scales.py goals|tables [--agents NAME ...] [--seeds 10] [--steps N] [--evaluations 10]
                                 [--episodes 20] [--scales .01 1 100] [--training NAME=VALUE ...] [--within SECONDS]
                                 [--devices 0 ...] [--out DIR]
 
 ``goals`` are three goals of a point mass, a third of a circle apart and equally far from the start, whose tasks differ
-by goal and scale. ``tables`` are three small decision processes with discrete actions, and ``game`` is MinAtar's
-Breakout three times, by gymnax, whose tasks differ by scale alone (for a GPU). Each agent learns the tasks twice: with
-the scales, and as its own control with all scales 1. ``impala`` and ``distral`` learn from rewards as they are;
-``impala-popart`` and ``distral-popart`` have PopArt in the units of each task (Hessel et al. 2019); and
+by goal and scale. ``tables`` are three small decision processes with discrete actions. Each agent learns the tasks
+twice: with the scales, and as its own control with all scales 1. ``impala`` and ``distral`` learn from rewards as they
+are; ``impala-popart`` and ``distral-popart`` have PopArt in the units of each task (Hessel et al. 2019); and
 ``impala-clipped`` clips rewards to [-1, 1], as was usual before.
 
 Every run is a process of its own with all seeds in one program, and writes ``OUT/AGENT.json`` or
@@ -79,13 +78,6 @@ PROTOCOLS = {
         5000,
         {"num_tasks": 3, "split": "none"},
         {"impala": {**_IMPALA, "gamma": 0.9}},
-    ),
-    "game": Protocol(
-        "gymnax:Breakout-MinAtar",
-        ("impala", "impala-clipped", "impala-popart"),
-        100_000,
-        {"vary": {"reward-scale": [0.999, 1.0, 1.001]}, "split": "none"},  # of the control, whose tasks must differ
-        {"impala": {**_IMPALA, "hidden": (128, 128), "num_envs": 64, "gamma": 0.99}},
     ),
 }
 
