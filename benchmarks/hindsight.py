@@ -50,14 +50,7 @@ def main() -> None:
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the agent or the loop")
     parser.add_argument("--out", type=Path, default=Path("runs") / "hindsight")
     parts.add_flags(parser)
-    parts.run_ways(__file__, parser.parse_args(), part, measure, table)
-
-
-def part(arguments: argparse.Namespace, way: str) -> parts.Part:
-    """Return the part of a way."""
-    numbers = ("env", "agent", "share", "seeds", "steps", "evaluations", "episodes", "out")
-    options = [f"--{name}={getattr(arguments, name)}" for name in numbers]
-    return parts.Part(way, [*options, "--ways", way, "--training", *arguments.training])
+    parts.run_ways(__file__, parser.parse_args(), measure, table)
 
 
 def measure(arguments: argparse.Namespace, way: str) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 STARTED = "BENCHMARK_STARTED"  # the clock when the process of a part was started
+_OF_RUNNING = ("seconds", "within", "devices")  # flags of ``add_flags``
 _GRACE = 60.0  # seconds between asking a process to stop and ending it
 
 
@@ -48,7 +49,6 @@ def add_flags(parser: argparse.ArgumentParser, seconds: float | None = None) -> 
 def run_ways(
     script: str,
     arguments: argparse.Namespace,
-    part: Callable[[argparse.Namespace, str], Part],
     measure: Callable[[argparse.Namespace, str], None],
     table: Callable[[Path], str],
     last: Collection[str] = (),
@@ -56,6 +56,7 @@ def run_ways(
     """Measure a way if this process is its part. Else run all ways that have no result yet, and print the table.
 
     Args:
+        arguments: ``ways``, those of ``add_flags``, and others, which every part is given too.
         last: ways that need results of others, and begin only once all others are done.
     """
     if is_part():
@@ -63,9 +64,20 @@ def run_ways(
     left: list[str] = []
     for late in (False, True):
         ways = [way for way in arguments.ways if (way in last) == late]
-        left = left or run_parts(script, [part(arguments, way) for way in ways], arguments.out, arguments)
+        left = left or run_parts(script, [_of_way(arguments, way) for way in ways], arguments.out, arguments)
     print(table(arguments.out))
     require_all(left)
+
+
+def _of_way(arguments: argparse.Namespace, way: str) -> Part:
+    """Return the part of a way, with all that was given to its benchmark but how to run parts."""
+    words = ["--ways", way]
+    for name, value in vars(arguments).items():
+        if name in ("ways", *_OF_RUNNING) or value is None:
+            continue
+        flag = f"--{name.replace('_', '-')}"
+        words += [flag, *map(str, value)] if isinstance(value, list) else [f"{flag}={value}"]
+    return Part(way, words)
 
 
 def whole(text: str) -> int:

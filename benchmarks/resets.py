@@ -52,15 +52,7 @@ def main() -> None:
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the agent or the loop")
     parser.add_argument("--out", type=Path, default=Path("runs") / "resets")
     parts.add_flags(parser)
-    parts.run_ways(__file__, parser.parse_args(), part, measure, table)
-
-
-def part(arguments: argparse.Namespace, way: str) -> parts.Part:
-    """Return the part of a way."""
-    names = ("env", "agent", "seeds", "steps", "evaluations", "episodes", "out")
-    options = [f"--{name}={x}" for name in names if (x := getattr(arguments, name)) is not None]
-    lists = ["--env-settings", *arguments.env_settings, "--training", *arguments.training]
-    return parts.Part(way, [f"--ways={way}", *options, *lists])
+    parts.run_ways(__file__, parser.parse_args(), measure, table)
 
 
 def measure(arguments: argparse.Namespace, way: str) -> None:

@@ -40,17 +40,16 @@ import mtjax
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.report import stats
 
-_JOINT = {"sharing": "all", "sampler": "by-length"}
 _NEW: dict[str, Any] = {"split": "none", "sketched": False, "heads": "disjoint", "conditioning": "none", "gamma": 0.95}
 _NEW |= {"endings": "stop", "normalize_observations": False}
 _NEW |= {"deliberation_cost": 0.0}  # which teaches to choose options that last, where these stay as they are
 SKETCHED: dict[str, dict[str, Any]] = {
     "modular": {"split": "none"},
     "independent": {"split": "none", "sharing": "tasks"},
-    "joint": {"split": "none", "conditioning": "one-hot", **_JOINT},
+    "joint": {"split": "none", "sharing": "all", "conditioning": "one-hot"},
     "no-curriculum": {"split": "none", "sampler": "uniform"},
     "zero-shot": {"split": "dense"},
-    "joint-zero-shot": {"split": "dense", "conditioning": "parameters", **_JOINT},
+    "joint-zero-shot": {"split": "dense", "sharing": "all", "conditioning": "parameters"},
 }
 UNSKETCHED: dict[str, dict[str, Any]] = {"adapted": {"keep_options": True, **_NEW}, "from-scratch": _NEW}
 WAYS = SKETCHED | UNSKETCHED
@@ -68,14 +67,7 @@ def main() -> None:
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of agent, loop and family")
     parser.add_argument("--out", type=Path, default=Path("runs") / "sketches")
     parts.add_flags(parser)
-    parts.run_ways(__file__, parser.parse_args(), part, measure, table, last=UNSKETCHED)
-
-
-def part(arguments: argparse.Namespace, way: str) -> parts.Part:
-    """Return the part of a way."""
-    options = [f"--{name}={getattr(arguments, name)}" for name in ("env", "seeds", "evaluations", "episodes", "out")]
-    options += [f"--new-steps={arguments.new_steps}", *[f"--steps={arguments.steps}"] * bool(arguments.steps)]
-    return parts.Part(way, [*options, "--ways", way, "--training", *arguments.training])
+    parts.run_ways(__file__, parser.parse_args(), measure, table, last=UNSKETCHED)
 
 
 def measure(arguments: argparse.Namespace, way: str) -> None:

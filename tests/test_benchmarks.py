@@ -789,9 +789,9 @@ def test_ways_that_need_others_begin_once_these_are_done(script, tmp_path, monke
     parts, stages = script("parts"), []
     run = lambda script, ways, *_: (stages.append([way.name for way in ways]), unfinished)[1]
     monkeypatch.setattr(parts, "run_parts", run)
-    arguments, part = SimpleNamespace(ways=["b", "a"], out=tmp_path), lambda arguments, way: parts.Part(way, [])
+    arguments = SimpleNamespace(ways=["b", "a"], out=tmp_path)
     with pytest.raises(SystemExit, match="left: a") if unfinished else contextlib.nullcontext():
-        parts.run_ways("script", arguments, part, lambda *_: None, lambda out: "", last=["b"])
+        parts.run_ways("script", arguments, lambda *_: None, lambda out: "", last=["b"])
     assert stages == begun
 
 

@@ -9,7 +9,7 @@ from mtjax.types import Spec
 class Beginning(NamedTuple):
     """Holds what an agent takes of a run of another one. All else of its state is fresh."""
 
-    nets: tuple[str, ...]  # names of the networks, of which tasks have nothing for themselves
+    nets: tuple[str, ...]  # names of networks; all tasks share them
     settings: Mapping[str, Any]  # of the agent, as these networks ask for
     spec: Spec  # of tasks as these networks see and play them
     tasks: str  # which tasks these are, in words

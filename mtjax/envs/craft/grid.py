@@ -44,7 +44,7 @@ _PAINTS = {
 _WALL, _SKIN, _NOSE = (0.35, 0.3, 0.27, 1.0), (0.95, 0.95, 0.95, 1.0), (0.1, 0.1, 0.1, 1.0)
 _BITS = 32  # of a number that holds a column of cells
 _LEAST, _MOST = 4, _BITS - 2  # cells
-_AT_ONCE = 8  # layouts of a round, of which the first that can be reached is taken
+_AT_ONCE = 8  # layouts that are drawn in a round; the first sound one is taken
 _UNDER = -5.0  # [m] height of what is not there
 
 
