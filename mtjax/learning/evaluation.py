@@ -197,7 +197,7 @@ def evaluate(
 
     def step(carry, time: Array):
         before, scores, alive = carry
-        drawn = _at(keys, -1 - time) if episodes.sampled else None  # those from 0 on begin episodes
+        drawn = _drawing(keys, time) if episodes.sampled else None
         worlds, env_step = step_envs(env, agent, state, tasks, before, drawn, trials=trials)
         worlds = _go_on(env, agent, state, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
         now = alive[..., None] & _is_now(before, trials.episodes)
@@ -297,6 +297,11 @@ def _at(keys: Key, time: Array) -> Key:
     return jax.vmap(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)), (0, None))(keys, time)
 
 
+def _drawing(keys: Key, time: Array) -> Key:
+    """Return the keys (S, T, E) that draw the actions of a step at a time (): none of them begins an episode."""
+    return _at(keys, -1 - time)
+
+
 def _go_on(
     env: Env,
     agent: Agent,
@@ -359,7 +364,7 @@ def record(
 
     def step(carry: tuple[Worlds, Array], time: Array):
         before, alive = carry
-        drawn = _at(keys, -1 - time) if sampled else None
+        drawn = _drawing(keys, time) if sampled else None
         worlds, env_step = step_envs(env, agent, learners, tasks, before, drawn, trials=trials)
         now, transition = alive[..., None] & _is_now(before, trial), env_step.transition
         begun = _go_on(env, agent, learners, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
