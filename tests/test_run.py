@@ -44,7 +44,7 @@ from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of, new_directory
 from mtjax.saved.records import Records
 from mtjax.training import entries, journal, run
-from mtjax.training.console import Clock
+from mtjax.training.console import Clock, duration
 from mtjax.training.journal import Journal
 from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import SPLITS, InputError
@@ -212,7 +212,7 @@ def test_profile_is_of_one_warm_chunk(play, tmp_path, capsys):
     chunks = [i for i, line in enumerate(lines) if "of 300 steps" in line]
     assert trace.stat().st_size and len(said) == 1 and chunks[0] < said[0] < chunks[1]
     compiled = next(line for line in lines if line.startswith("compiled in "))
-    assert compiled == f"compiled in {result.compile_seconds:.1f} s" and result.compile_seconds > 0
+    assert compiled == f"compiled in {duration(result.compile_seconds)}" and result.compile_seconds > 0
     assert result.seconds == pytest.approx(float(result.rows[-1]["seconds"]), abs=1e-3)
 
 

@@ -340,7 +340,7 @@ def keep_states(worlds: Worlds, transition: Transition) -> Any:
     return worlds.state
 
 
-@partial(jax.jit, static_argnums=(0, 1, 5, 6, 7), static_argnames="sampled")
+@partial(jax.jit, static_argnames=("env", "agent", "trial", "keep", "sampled"))
 def record(
     env: Env,
     agent: Agent,
