@@ -5,15 +5,17 @@
 Ours is a chunk of ``mtjax.train`` for an agent that acts at random and learns nothing: it acts in every world by a key
 of its own, steps, begins ended episodes anew, sums returns, and looks for numbers that are not finite. Theirs is a scan
 of the package's step, mapped over worlds, with its automatic reset and random actions; of EnvPool a loop in Python over
-``step`` of one pool. Both are compiled first and then timed in turn, round after round, in one process, so that other
-load on the machine affects both. Figures are medians over rounds, and ratios are medians of each round's ratio, of
-seconds and of the CPU seconds of the process.
+``step`` of one pool. A scan that keeps nothing learns nothing, so theirs is timed a second time where it keeps the
+observations of the last 32 steps, as a learner has to. All are compiled first and then timed in turn, round after
+round, in one process, so that other load on the machine affects all. Figures are medians over rounds, and ratios are
+medians of each round's ratio, of seconds and of the CPU seconds of the process.
 """
 
 import argparse
 import dataclasses
 import statistics
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -38,6 +40,7 @@ class Contest(NamedTuple):
     steps: int  # of every world in a timed call, a multiple of a rollout's
 
 
+UNROLL = 32  # steps of a rollout
 CONTESTS = {
     "gymnax:CartPole-v1": Contest(1024, 1024),
     "gymnax:Breakout-MinAtar": Contest(1024, 512),
@@ -93,22 +96,23 @@ def main() -> None:
     for name in arguments.names:
         rows.append(compare(name, arguments.repeats))
         line = (
-            "{environment}: ours {ours:,.0f}, theirs {theirs:,.0f} steps/s; ratio {ratio:.2f}, of CPU {cpu_ratio:.2f}"
+            "{environment}: ours {ours:,.0f}, theirs {theirs:,.0f} steps/s; ratio {ratio:.2f}, of CPU {cpu_ratio:.2f}, "
+            "where theirs keeps observations {kept_ratio:.2f}"
         )
         print(line.format(**rows[-1]), flush=True)
     publish(arguments, rows)
 
 
 def compare(name: str, repeats: int) -> dict[str, Any]:
-    """Time our loop and the package's own scan in turn."""
+    """Time our loop and the package's own scans in turn."""
     contest, family = CONTESTS[name], mtjax.make(name)
     settings = Settings(num_envs=contest.worlds, chunk_steps=contest.steps)
-    agent: Any = Chance(family.spec.action, Rollouts(unroll=32, epochs=1, minibatches=1))
+    agent: Any = Chance(family.spec.action, Rollouts(unroll=UNROLL, epochs=1, minibatches=1))
     training = Training(family, agent, settings, most_devices=1)
     make = own_pool if name.startswith("envpool:") else own_scan
-    theirs = make(name, family.spec.action, contest)
-    rounds = [(timed(training.time), timed(theirs)) for _ in range(repeats)]
-    (seconds, cpu), (own, own_cpu) = (zip(*times, strict=True) for times in zip(*rounds, strict=True))
+    theirs, keeping = (make(name, family.spec.action, contest, kept) for kept in (False, True))
+    rounds = [[timed(run) for run in (training.time, theirs, keeping)] for _ in range(repeats)]
+    (seconds, cpu), (own, own_cpu), (kept, _) = (zip(*times, strict=True) for times in zip(*rounds, strict=True))
     ratios = [theirs / ours for ours, theirs in zip(seconds, own, strict=True)]
     count = contest.worlds * contest.steps
     return {
@@ -118,6 +122,8 @@ def compare(name: str, repeats: int) -> dict[str, Any]:
         "theirs": count / statistics.median(own),
         "ratio": statistics.median(ratios),
         "ratios": [round(x, 3) for x in sorted(ratios)],
+        "keeping": count / statistics.median(kept),
+        "kept_ratio": statistics.median(theirs / ours for ours, theirs in zip(seconds, kept, strict=True)),
         "cpu_ratio": statistics.median(theirs / ours for ours, theirs in zip(cpu, own_cpu, strict=True)),
     }
 
@@ -129,23 +135,33 @@ def timed(run: Callable[[], Any]) -> tuple[float, float]:
     return time.perf_counter() - before[0], time.process_time() - before[1]
 
 
-def own_scan(name: str, action: Action, contest: Contest) -> Callable[[], Any]:
-    """Return the package's contestant: a call that goes on with all of its worlds."""
+def own_scan(name: str, action: Action, contest: Contest, keeps: bool) -> Callable[[], Any]:
+    """Return the package's contestant: a call that goes on with all of its worlds.
+
+    Args:
+        keeps: hold the observations of the last rollout, in place of their sums.
+    """
     suite, _, own = name.partition(":")
     reset, step = OWN[suite](own)
 
-    def play(carry: Any) -> tuple[Any, Any]:
-        def once(carry: Any, _: Any) -> tuple[Any, Any]:
-            state, key = carry
-            key, act_key, step_key = jax.random.split(key, 3)
-            actions = action.random(act_key, (contest.worlds,))
-            obs, state, reward = jax.vmap(step)(jax.random.split(step_key, contest.worlds), state, actions)
-            return (state, key), jnp.sum(reward) + sum(jnp.sum(x) for x in jax.tree.leaves(obs))
+    def once(carry: Any, _: Any) -> tuple[Any, Any]:
+        state, key = carry
+        key, act_key, step_key = jax.random.split(key, 3)
+        actions = action.random(act_key, (contest.worlds,))
+        obs, state, reward = jax.vmap(step)(jax.random.split(step_key, contest.worlds), state, actions)
+        return (state, key), (jnp.sum(reward), obs if keeps else sum(jnp.sum(x) for x in jax.tree.leaves(obs)))
 
-        return jax.lax.scan(once, carry, length=contest.steps)
+    def rollout(carry: Any, _: Any) -> tuple[Any, Any]:
+        worlds, (reward, obs) = jax.lax.scan(once, carry[0], length=UNROLL)
+        return (worlds, obs), reward
+
+    def play(carry: Any) -> tuple[Any, Any]:
+        return jax.lax.scan(rollout, carry, length=contest.steps // UNROLL)
 
     states = jax.jit(jax.vmap(reset))(jax.random.split(jax.random.key(0), contest.worlds))
-    carry = jax.tree.map(jnp.copy, (states, jax.random.key(1)))
+    worlds = jax.tree.map(jnp.copy, (states, jax.random.key(1)))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(rollout, (worlds, None), None)[0][1])
+    carry = (worlds, nothing)
     program = jax.jit(play, donate_argnums=0).lower(carry).compile()
     held = [program(carry)[0]]
 
@@ -155,8 +171,12 @@ def own_scan(name: str, action: Action, contest: Contest) -> Callable[[], Any]:
     return run
 
 
-def own_pool(name: str, action: Any, contest: Contest) -> Callable[[], Any]:
-    """Return EnvPool's contestant: a call that steps a pool with its own settings and single pictures."""
+def own_pool(name: str, action: Any, contest: Contest, keeps: bool) -> Callable[[], Any]:
+    """Return EnvPool's contestant: a call that steps a pool with its own settings and single pictures.
+
+    Args:
+        keeps: hold the pictures of the last rollout.
+    """
     import envpool  # type: ignore  # not a dependency of this package
 
     pool = envpool.make(name.partition(":")[2], env_type="gymnasium", num_envs=contest.worlds, stack_num=1)
@@ -164,8 +184,9 @@ def own_pool(name: str, action: Any, contest: Contest) -> Callable[[], Any]:
     random = np.random.default_rng(0)
 
     def run() -> None:
+        kept = deque(maxlen=UNROLL * keeps)
         for _ in range(contest.steps):
-            pool.step(random.integers(0, action.size, contest.worlds))
+            kept.append(pool.step(random.integers(0, action.size, contest.worlds))[0])
 
     run()
     return run

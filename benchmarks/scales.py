@@ -1,14 +1,15 @@
 """Measure what scales of rewards do: tasks whose rewards differ by .01, 1 and 100, with and without PopArt.
 
-    python benchmarks/scales.py goals|tables [--agents NAME ...] [--seeds 10] [--steps N] [--evaluations 10]
+    python benchmarks/scales.py goals|tables|games [--agents NAME ...] [--seeds 10] [--steps N] [--evaluations 10]
                                 [--episodes 20] [--scales .01 1 100] [--training NAME=VALUE ...] [--within SECONDS]
                                 [--devices 0 ...] [--out DIR]
 
 ``goals`` are three goals of a point mass, a third of a circle apart and equally far from the start, whose tasks differ
-by goal and scale. ``tables`` are three small decision processes with discrete actions. Each agent learns the tasks
-twice: with the scales, and as its own control with all scales 1. ``impala`` and ``distral`` learn from rewards as they
-are; ``impala-popart`` and ``distral-popart`` have PopArt in the units of each task (Hessel et al. 2019); and
-``impala-clipped`` clips rewards to [-1, 1], as was usual before.
+by goal and scale. ``tables`` are three small decision processes with discrete actions. ``games`` are three of
+MinAtar's, which gymnax brings. Each agent learns the tasks twice: with the scales, and as its own control with all
+scales 1. ``impala`` and ``distral`` learn from rewards as they are; ``impala-popart`` and ``distral-popart`` have
+PopArt in the units of each task (Hessel et al. 2019); and ``impala-clipped`` clips rewards to [-1, 1], as was usual
+before.
 
 Every run is a process of its own with all seeds in one program, and writes ``OUT/AGENT.json`` or
 ``OUT/AGENT-control.json`` with the returns (S, V, T) of all evaluations, under the mean action, each divided by its
@@ -49,6 +50,8 @@ CONTROL = "control"
 _ANGLES = [2 * math.pi * i / 3 for i in range(3)]
 _GOALS = {"goal-x": [0.2 * math.cos(x) for x in _ANGLES], "goal-y": [0.2 * math.sin(x) for x in _ANGLES]}
 
+_GAMES = [f"gymnax:{game}-MinAtar" for game in ("Breakout", "SpaceInvaders", "Freeway")]
+
 
 class Protocol(NamedTuple):
     """Holds the tasks, the agents, and how these learn unless other settings are given."""
@@ -78,6 +81,13 @@ PROTOCOLS = {
         5000,
         {"num_tasks": 3, "split": "none"},
         {"impala": {**_IMPALA, "gamma": 0.9}},
+    ),
+    "games": Protocol(
+        "+".join(_GAMES),
+        ("impala", "impala-clipped", "impala-popart"),
+        25_000,
+        {},
+        {"impala": {"conditioning": "one-hot", "hidden": (128, 128), "num_envs": 64, "entropy_cost": 0.01}},
     ),
 }
 
@@ -122,7 +132,7 @@ def measure(arguments: argparse.Namespace, agent: str) -> None:
     protocol, (learner, own), scales = PROTOCOLS[arguments.tasks], AGENTS[agent], np.array(arguments.scales)
     given = {**protocol.settings[learner], **own}
     given |= settings_of(arguments.training)
-    plain = with_preset(protocol.env, learner, **varied(protocol.family, arguments.scales))
+    plain = with_preset(protocol.env, learner, **varied(protocol, arguments.scales))
     iterations = arguments.steps or protocol.steps
     chunk = iterations // arguments.evaluations
     made, settings = configure(plain.learner, plain.training, {**given, "chunk_steps": chunk})
@@ -145,6 +155,7 @@ def measure(arguments: argparse.Namespace, agent: str) -> None:
         "agent": agent,
         "control": is_control,
         "scales": arguments.scales,
+        "tasks": list(result.env.labels("train")),
         "returns": np.round(returns, 4).tolist(),
         "loop": str(settings),
         **resumable.summary(result),
@@ -153,11 +164,14 @@ def measure(arguments: argparse.Namespace, agent: str) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def varied(family: dict[str, Any], scales: list[float]) -> dict[str, Any]:
-    """Return the settings of a family whose tasks have these scales; of equal ones, nothing scales."""
+def varied(protocol: Protocol, scales: list[float]) -> dict[str, Any]:
+    """Return the settings of a family whose tasks have these scales, or of games; of equal ones, nothing scales."""
     if len(set(scales)) == 1:
-        return family
-    return family | {"vary": {**family.get("vary", {}), "reward-scale": scales}}
+        return protocol.family
+    games = protocol.env.split("+")
+    several = {f"{game}.reward-scale": scale for game, scale in zip(games, scales, strict=False)}
+    scaled = {"reward-scale": scales} if len(games) == 1 else several
+    return protocol.family | {"vary": protocol.family.get("vary", {}) | scaled}
 
 
 def table(out: Path) -> str:
