@@ -14,8 +14,8 @@ import mtjax.train
 from mtjax.envs.engines import host
 from mtjax.envs.engines.host import explaining
 from mtjax.envs.hosted.envpool import EnvPool
-from mtjax.envs.hosted.family import _known
 from mtjax.envs.hosted.gymnasium import Separate
+from mtjax.envs.hosted.stepping import _known
 from mtjax.evaluate import main as evaluate_main
 from mtjax.learning import evaluation, rollout
 from mtjax.saved.records import Records

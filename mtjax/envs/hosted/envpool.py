@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from mtjax.envs.hosted.family import Hosted, parameters_of, typed
+from mtjax.envs.hosted.family import Hosted, parameters_of, read_arguments
 from mtjax.envs.hosted.worlds import Outcome
 from mtjax.envs.parameters import Parameter
 from mtjax.names import nearest_error
@@ -40,7 +40,7 @@ class EnvPool(Hosted):
     environment: str = "Pong-v5"
     """EnvPool's name of the environment."""
 
-    suite: ClassVar[str] = "envpool"
+    engine_name: ClassVar[str] = "envpool"
 
     def __post_init__(self):
         super().__post_init__()
@@ -57,24 +57,20 @@ class EnvPool(Hosted):
         try:
             found = module.make_spec(self.environment)
             alone = {"stack_num": 1} if hasattr(found.config, "stack_num") else {}
-            return module.make_spec(self.environment, **{**alone, **self.fixed})
+            return module.make_spec(self.environment, **{**alone, **read_arguments(self.arguments)})
         except Exception as error:  # of any kind, as its parts differ
             line = next(iter(str(error).strip().splitlines()), "")
             raise InputError(f"{self.environment} cannot be made: {type(error).__name__}: {line}") from error
 
     @cached_property
-    def _settings(self) -> dict[str, Any]:
+    def defaults(self) -> Mapping[str, Any]:
         settings = self.original.config._asdict()
         return {name: x for name, x in settings.items() if isinstance(x, int | float) and name not in _OF_POOLS}
 
     @cached_property
     def every_parameter(self) -> Mapping[str, Parameter]:  # type: ignore[override]
         """Return EnvPool's settings of the environment that are numbers."""
-        return parameters_of(self._settings)
-
-    def read_value(self, name: str, value: float) -> Any:
-        """Return a setting's value, of the type that its default has."""
-        return typed(self.environment, name, self._settings[name.replace("-", "_")], value)
+        return parameters_of(self.defaults)
 
     @property
     def spaces(self) -> tuple[Any, Any]:

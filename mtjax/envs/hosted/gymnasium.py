@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mtjax.checks import shown
-from mtjax.envs.hosted.family import Hosted, as_picture, parameters_of, typed
+from mtjax.envs.hosted.family import Hosted, as_picture, parameters_of, read_arguments
 from mtjax.envs.hosted.spaces import form
 from mtjax.envs.hosted.worlds import Outcome
 from mtjax.envs.parameters import Parameter
@@ -38,7 +38,7 @@ class Gymnasium(Hosted):
     environment: str = "CartPole-v1"
     """Name of the environment in Gymnasium's registry, or module:NAME for a module that registers it."""
 
-    suite: ClassVar[str] = "gymnasium"
+    engine_name: ClassVar[str] = "gymnasium"
 
     @cached_property
     def registered(self) -> Any:
@@ -63,12 +63,8 @@ class Gymnasium(Hosted):
         given = {name: 0.0 for name, _ in self.vary if name.replace("-", "_") not in known} if any_other else {}
         return parameters_of(known | given)
 
-    def read_value(self, name: str, value: float) -> Any:
-        """Return a parameter's value, of the type that its default has."""
-        return typed(self.environment, name, self._defaults.get(name.replace("-", "_")), value)
-
     @cached_property
-    def _defaults(self) -> dict[str, Any]:
+    def defaults(self) -> Mapping[str, Any]:
         return arguments(self.registered.entry_point)[0] | self.registered.kwargs
 
     def make(self, row: int | None, filmed: bool = False) -> Any:
@@ -77,7 +73,7 @@ class Gymnasium(Hosted):
         Raises:
             InputError: it cannot be made.
         """
-        gymnasium, given = gymnasium_module(), self.fixed if row is None else self.arguments_of(row)
+        gymnasium, given = gymnasium_module(), read_arguments(self.arguments) if row is None else self.arguments_of(row)
         shows = {"render_mode": "rgb_array"} if filmed and self.films else {}
         try:
             return gymnasium.make(
