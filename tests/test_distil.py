@@ -245,6 +245,16 @@ def test_the_teacher_acts_for_a_share_of_the_steps(share):
     assert np.all(taken > 0.999) == bool(share)
 
 
+@pytest.mark.slow
+def test_the_teacher_acts_in_no_evaluation():
+    """Not in those by drawn actions either, where it would have earned 0: the learner has learned nothing yet."""
+    env = Guess("by-action")
+    run = told(env, [math.atanh(0.6), -9.0], [-math.atanh(0.6), -9.0])
+    few = {**LEARN, "steps": 2 * 16 * 30, "actor_lr": 1e-6, "eval_sampled": True, "eval_episodes": 50}
+    found = [last_returns(train_objects(env, tiny("distil", teacher_share=x), start=(run,), **few)) for x in (0.0, 1.0)]
+    assert np.all(np.abs(found[0] - found[1]) < 0.5) and np.all(found[1] < -1.5), found
+
+
 # By the program.
 
 

@@ -9,6 +9,7 @@ from test_ppo import BEST, KNOWN, SCALES, random_steps
 
 from mtjax import agents
 from mtjax.agents import critics
+from mtjax.agents.base import judged
 from mtjax.agents.parts import targets
 from mtjax.envs.probes import Probe
 from mtjax.experience import rollouts
@@ -76,6 +77,15 @@ def test_the_policy_that_acts_lags_behind():
     assert np.array_equal(acted[0], acted[1]) and np.array_equal(acted[0], acted[2])
     assert not np.allclose(acted[2], acted[3]) and not np.allclose(played[0], played[1])
     np.testing.assert_array_equal(acted[3], act(agent, state, KEY))
+
+
+def test_evaluations_by_drawn_actions_draw_them_from_the_present_policy():
+    agent, lagging = small(actor_lr=0.1), small(actor_lr=0.1, actor_lag=3)
+    task, obs = pick(TASKS, 0), jnp.float32([0.3, -1.0, 2.0])
+    act = lambda agent: agent.act(state, agent.begin(state, task), obs, task, KEY).action
+    state = learn(lagging, lagging.init(SPEC, TASKS, KEY), random_steps(lagging), TASKS, KEY)[0]
+    np.testing.assert_array_equal(act(judged(lagging)), act(agent))
+    assert not np.array_equal(act(judged(lagging)), act(lagging))
 
 
 @pytest.mark.parametrize("lag", slow_but([0, 4], 4))

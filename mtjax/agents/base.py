@@ -121,6 +121,8 @@ class BaseAgent(abc.ABC):
     """How the actor remembers tasks that it learned one after another."""
     plasticity: ClassVar[Plasticity] = Plasticity()
     """What keeps the networks able to learn."""
+    in_training: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    """Fields that say who acts in training, with the values by which the learned policy acts alone."""
     taught: ClassVar[bool] = False
     """Whether it learns from the policies of other runs, which --from names, instead of going on with theirs."""
     begins_from: ClassVar[Mapping[type, Callable[[Any, Spec], Beginning]]] = MappingProxyType({})
@@ -341,3 +343,8 @@ def network_of(agent: BaseAgent, name: Literal["actor", "critic"]) -> Network:
     own = {"shared": (), "per-task": ("head",), "disjoint": ("sight", "body", "head")}[combinations.heads(agent, name)]
     front = None if agent.representation.learns else agent.encoder.front()
     return Network(agent.encoder.body(hidden, layer_norm), own, front, agent.unit_head)
+
+
+def judged(agent: Any) -> Any:
+    """Return the agent that evaluations, films and policies play: what it has learned acts, and nothing else."""
+    return dataclasses.replace(agent, **agent.in_training) if agent.in_training else agent

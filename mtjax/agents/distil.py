@@ -1,6 +1,8 @@
 """Distillation trains one policy to act as trained ones do."""
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
@@ -63,6 +65,7 @@ class Distil(BaseAgent):
     policies: ClassVar[tuple[type[Policy], ...]] = (Gaussian, Categorical)
     devices_differ: ClassVar[bool] = True
     taught: ClassVar[bool] = True
+    in_training: ClassVar[Mapping[str, Any]] = MappingProxyType({"teacher": None})
     normalize_observations: bool = True
     """Scale observations to mean 0 and variance 1, by moments of training data alone, and clip them to +-10."""
     max_gradient_norm: float = 1.0

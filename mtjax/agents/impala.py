@@ -1,7 +1,9 @@
 """IMPALA trains an actor-critic from rollouts of older policies, corrected by V-trace."""
 
 import dataclasses
+from collections.abc import Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal
 
 import jax
@@ -40,6 +42,7 @@ class IMPALA(OnPolicy):
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (*OnPolicy.adjustable, "actor_lag")
+    in_training: ClassVar[Mapping[str, Any]] = MappingProxyType({"actor_lag": 0})
     gae_lambda: float = 1.0
     """Lambda of V-trace: 0 relies on the critic alone, 1 on the rewards of the rollout."""
     value_normalization: Literal["none", "running", "popart"] = "popart"

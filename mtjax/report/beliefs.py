@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents.base import judged
 from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.state import of_task
 from mtjax.envs.engines import host
@@ -87,7 +88,7 @@ def believed(policy: Policy, split: str = "train") -> Believed:
     env, tasks = policy.env, policy.env.tasks(split)
     if not len(tasks.id):
         raise InputError(f"this run has no tasks of the split {split}")
-    play = partial(record, env, policy.agent, policy.state, tasks, trial=policy.trial, keep=_keep)
+    play = partial(record, env, judged(policy.agent), policy.state, tasks, trial=policy.trial, keep=_keep)
     read = jax.jit(partial(_read, policy.agent))
     with host.explaining():
         played = [play(jnp.int32(0))]

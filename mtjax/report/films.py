@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from mtjax.agents.base import judged
 from mtjax.checks import amount
 from mtjax.envs.engines import host
 from mtjax.envs.mixtures import FamilyOrMixture, apart
@@ -133,7 +134,7 @@ def play(policy: Policy, tasks: Task, seed: int, sampled: bool = False) -> tuple
     with contextlib.ExitStack() as filmed, host.explaining():
         for part in env.parts:
             filmed.enter_context(part.family.filmed())
-        given = env, policy.agent, policy.state, tasks, jnp.int32(seed), policy.trial
+        given = env, judged(policy.agent), policy.state, tasks, jnp.int32(seed), policy.trial
         played = record(*given, sampled=sampled)
         played = jax.block_until_ready(played)
     return played, {part.name: states for part, states in zip(env.parts, apart(played.kept), strict=True)}

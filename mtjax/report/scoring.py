@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mtjax.agents.base import judged
 from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.checks import amount, path, require_episodes
 from mtjax.compiling.programs import compile_lowered, enable_compile_cache, trace
@@ -264,7 +265,7 @@ def score(
     rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
     arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
     arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))
-    program = trace(evaluation.evaluate, env, policy.agent, episodes, *arguments)
+    program = trace(evaluation.evaluate, env, judged(policy.agent), episodes, *arguments)
     with host.explaining():
         found = jax.block_until_ready(compile_lowered(program.lower(), "seldom")(*arguments))
     return {split: found} if split in rows else {name: of_tasks(found, places) for name, places in rows.items()}

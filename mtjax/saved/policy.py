@@ -12,6 +12,7 @@ import numpy as np
 
 from mtjax import frames
 from mtjax.agents import BaseAgent, name_of, swept
+from mtjax.agents.base import judged
 from mtjax.agents.swept import Point
 from mtjax.agents.teacher import leave
 from mtjax.checks import path, require_whole, shown
@@ -105,7 +106,7 @@ class Policy:
 
     def _act(self, obs: Any, task: Task, key: Key | None, memory: Any) -> Array:
         memory = self.begin(task) if memory is None else memory
-        return self.agent.act(self.state, memory, obs, task, key).action
+        return judged(self.agent).act(self.state, memory, obs, task, key).action
 
     def _task(self, parameters: dict[str, Any], size: int | None) -> tuple[Task, bool]:
         """Return the task with these parameters, and whether it is one for each of ``size`` observations."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from mtjax.agents.base import judged
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
 from mtjax.envs.engines import host
@@ -127,7 +128,7 @@ class _Run:
         chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
         plan = self.config.plan
         episodes = Episodes(plan.eval_episodes, settings.trials, plan.eval_sampled)
-        played = partial(trace, lazy.evaluate, env, agent, episodes, shapes.agent, everything, seeds)
+        played = partial(trace, lazy.evaluate, env, judged(agent), episodes, shapes.agent, everything, seeds)
         score = pool.submit(lambda: compile_lowered(played(np.int32(0)).lower(), "seldom"))
         pool.shutdown(wait=False)
         starts = selection.starts(self.config, seeds)
