@@ -16,7 +16,8 @@ from mtjax.envs.compiled import compile_model
 from mtjax.envs.engines.base import World
 from mtjax.envs.metaworld import names
 from mtjax.envs.metaworld.host import Host
-from mtjax.envs.metaworld.observables import Observables
+from mtjax.envs.metaworld.observables import Observables, shown
+from mtjax.envs.metaworld.starts import begin
 
 FOLDER = Path(__file__).parent / "data" / "metaworld"
 QUICK = ("assembly", "bin-picking", "coffee-pull", "door-open", "reach")
@@ -88,11 +89,11 @@ def test_episodes_begin_as_those_of_the_original(name):
     task, recorded = TASKS[name](), load(name)
     settled, off = Host(compile_model(task, {})).settle(task.hand_start), 4e-3 if name in LOOSE else 1e-3
     for episode, vec in enumerate(recorded["rand_vec"]):
-        start = task.begin(settled, settled.content(), vec)
+        start = begin(task, settled, settled.content(), vec)
         began = {key: recorded[f"const_{key}"][episode] for key in start.began}
         jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, atol=off), start.began, began)
         state = {key: np.float32(x) for key, x in start.state.items()}
-        objects = np.concatenate(task.objects(task._shown(World(extra=None, **state))))
+        objects = np.concatenate(task.objects(shown(World(extra=None, **state), task.watched)))
         np.testing.assert_allclose(objects, recorded["start_obs"][episode, 4 : 4 + objects.size], atol=off)
         arm = start.model.joint("right_j0").qposadr[0] + np.arange(7)
         qpos = np.abs(state["qpos"] - recorded["start_qpos"][episode])

@@ -3,27 +3,24 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import cached_property
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mtjax.envs.compiled import compile_model, stack_differing
+from mtjax.envs.compiled import stack_differing
 from mtjax.envs.domain import Domain
 from mtjax.envs.engines.base import World, choose_engine
-from mtjax.envs.metaworld import scene
-from mtjax.envs.metaworld.goals import draw_goals
+from mtjax.envs.metaworld import observables, scene, starts
 from mtjax.envs.metaworld.host import SUBSTEPS, Host
-from mtjax.envs.metaworld.names import TASKS, listed_with
-from mtjax.envs.metaworld.observables import Observables
+from mtjax.envs.metaworld.names import listed_with
+from mtjax.envs.metaworld.observables import HALF, HALF_HIGH, HALF_LOW, Observables
 from mtjax.envs.pixels import Mark
 from mtjax.envs.scenery import Visible
 from mtjax.envs.variation import Variation
-from mtjax.names import load
 from mtjax.types import SPLITS, Array, InputError, Key, Step, Task
 
 _STEP = 0.01  # [m] that an action of 1 moves the hand's target
@@ -33,17 +30,6 @@ _NOT_MJX = (
     "(pip install 'mtjax[warp]')"
 )
 _GOAL = "mtjax-goal"  # a geom of pictures
-_OBJECTS = 14  # entries of an observation for objects
-_HALF_LOW = np.array([-0.525, 0.348, -0.0525, -1.0, *[-np.inf] * _OBJECTS], np.float32)
-_HALF_HIGH = np.array([0.525, 1.025, 0.7, 1.0, *[np.inf] * _OBJECTS], np.float32)
-
-
-class Start(NamedTuple):
-    """How an episode of one goal begins."""
-
-    model: mujoco.MjModel
-    began: dict[str, np.ndarray]  # what the reward compares with
-    state: dict[str, np.ndarray]  # of the physics, by its name in World
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +105,7 @@ class Sawyer(Domain):
         if self.vary:
             raise InputError(f"Meta-World's tasks vary in their goals only, not in {next(iter(dict(self.vary)))}")
         if self.benchmark:
-            listed_with(self.benchmark, self._task)
+            listed_with(self.benchmark, starts.name_in_metaworld(self))
         if self.held_out and self.test_goals:
             raise InputError("a task that is held out trains on no goals; leave out test-goals")
         super().__post_init__()
@@ -172,64 +158,20 @@ class Sawyer(Domain):
         rows = {name: np.zeros((int(counts.get(name, False)), 0)) for name in SPLITS}
         return Variation((), rows, np.zeros((sum(counts.values()), self.num_draws, 0)), np.zeros(0), np.zeros(0))
 
-    def vectors(self) -> np.ndarray:
-        """Return the vectors (P, K) of all goals, first those of training."""
-        names, tasks = [self._task], (self,)
-        if self.benchmark:
-            names = listed_with(self.benchmark, self._task)
-            tasks = tuple(load(f"mtjax.envs.metaworld.{TASKS[name]}")() for name in names)
-        seeds = [self.task_seed + i for i in range(1 + self.test_goals)]
-        place = names.index(self._task)
-        return np.concatenate([draw_goals(tasks, seed, self.num_draws)[place] for seed in seeds])
-
-    @property
-    def _task(self) -> str:
-        """Return the task's name in Meta-World."""
-        place = f"{type(self).__module__.rpartition('.')[2]}:{type(self).__name__}"
-        return next((name for name, known in TASKS.items() if known == place), type(self).__name__)
-
-    @cached_property
-    def starts_of_goals(self) -> tuple[Start, ...]:
-        """Return how episodes begin, for every goal."""
-        settled = Host(compile_model(self, {})).settle(self.hand_start)
-        with ThreadPoolExecutor() as pool:
-            return tuple(pool.map(partial(self.begin, settled, settled.content()), self.vectors()))
-
-    def begin(self, settled: Host, content: bytes, vec: np.ndarray) -> Start:
-        """Begin an episode as Meta-World does, which resets twice: the second time, moved things are in place.
-
-        Args:
-            settled: the scene with nothing moved, whose hand has settled.
-            content: its model.
-        """
-        host, model = settled.copy(), settled.model
-        self.arrange(host, vec)
-        if host.content() == content:
-            host = settled.copy()
-        else:
-            host, model = host.settle(self.hand_start), host.model
-        tcp, data = host.tcp(), host.data
-        began = {"init_tcp": tcp} | {name: np.asarray(x, np.float64) for name, x in self.arrange(host, vec).items()}
-        state = {"qpos": data.qpos, "qvel": data.qvel, "warmstart": data.qacc_warmstart, "sensors": data.sensordata}
-        state["mocap"] = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
-        return Start(model, began, {name: x.copy() for name, x in state.items()})
+    vectors = starts.vectors  # (P, K)
+    starts_of_goals = cached_property(starts.starts_of_goals)
 
     @cached_property
     def models(self) -> tuple[mujoco.MjModel, ...]:
         """Return the model of every row of the table: first the tasks' (of their first goals)."""
-        return tuple(start.model for start in self._of_rows)
-
-    @property
-    def _of_rows(self) -> tuple[Start, ...]:
-        starts = self.starts_of_goals
-        return (*starts[:: self.num_draws], *starts)
+        return tuple(start.model for start in starts.of_rows(self))
 
     def build(self) -> dict[str, dict[str, Any]]:
-        starts = self._of_rows
+        found = starts.of_rows(self)
         stacked = lambda trees: {name: np.float32(np.stack([tree[name] for tree in trees])) for name in trees[0]}
-        states = {f"start_{name}": x for name, x in stacked([start.state for start in starts]).items()}
+        states = {f"start_{name}": x for name, x in stacked([start.state for start in found]).items()}
         model = {name: np.float32(leaf) for name, leaf in stack_differing(self.models).items()}
-        return {"model": model, "goal": stacked([start.began for start in starts]) | states}
+        return {"model": model, "goal": stacked([start.began for start in found]) | states}
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         return scene.read(self.scene_file, self.watched, self.pressed)
@@ -252,14 +194,14 @@ class Sawyer(Domain):
 
     def start(self, task: Task, key: Key) -> tuple[Array, ...]:
         began = task.goal
-        return began["start_qpos"], began["start_qvel"], jnp.zeros(4 + _OBJECTS), began["start_mocap"]
+        return began["start_qpos"], began["start_qvel"], jnp.zeros(HALF), began["start_mocap"]
 
     def reset(self, task: Task, key: Key) -> Step:
         """Begin an episode at the goal's settled start. Nothing is simulated."""
         names = ("qpos", "qvel", "warmstart", "sensors", "mocap")
         world = World(extra=None, **{name: task.goal[f"start_{name}"] for name in names})
-        world = world._replace(extra=self._half(world))
-        seen = self.look_at(task, world) if self.pixels else self._unclipped(task, world)
+        world = world._replace(extra=observables.half(self, world))
+        seen = self.look_at(task, world) if self.pixels else observables.unclipped(self, task, world)
         return Step(world, seen, jnp.float32(0), jnp.bool_(False), {"success": jnp.float32(0)})
 
     def control(self, task: Task, world: World, action: Array) -> tuple[World, Array]:
@@ -267,45 +209,17 @@ class Sawyer(Domain):
         way = jnp.clip(action[:3], -1.0, 1.0) * _STEP
         target = jnp.clip(world.mocap[0, :3] + way, jnp.array(self.hand_low), jnp.array(self.hand_high))
         mocap = jnp.concatenate([target, jnp.array(_DOWN)])[None]
-        return world._replace(mocap=mocap, extra=self._half(world)), jnp.stack([action[3], -action[3]])
+        return world._replace(mocap=mocap, extra=observables.half(self, world)), jnp.stack([action[3], -action[3]])
 
     def observe(self, task: Task, world: World) -> Array:
         goals = np.array(self.goal_box or [vec[3:] for vec in self.drawn], np.float32)
-        low = jnp.concatenate([_HALF_LOW, _HALF_LOW, goals[0]])
-        high = jnp.concatenate([_HALF_HIGH, _HALF_HIGH, goals[1]])
-        seen = jnp.clip(self._unclipped(task, world), low, high)
+        low = jnp.concatenate([HALF_LOW, HALF_LOW, goals[0]])
+        high = jnp.concatenate([HALF_HIGH, HALF_HIGH, goals[1]])
+        seen = jnp.clip(observables.unclipped(self, task, world), low, high)
         return seen.at[36:].set(0) if self.goal_hidden else seen
 
     def reward(self, task: Task, world: World, action: Array) -> Array:
-        return self.evaluate(self.at(task, world, action), task.goal)[0]
+        return self.evaluate(observables.at(self, task, world, action), task.goal)[0]
 
     def metrics(self, task: Task, world: World, action: Array) -> dict[str, Array]:
-        return {"success": self.evaluate(self.at(task, world, action), task.goal)[1].astype(jnp.float32)}
-
-    def at(self, task: Task, world: World, action: Array) -> Observables:
-        """Return what a world shows."""
-        return self._shown(world)._replace(obs=self.observe(task, world), action=action)
-
-    def _unclipped(self, task: Task, world: World) -> Array:
-        """Return the observation (39,) as it is at a reset."""
-        goal = jnp.zeros(3) if self.goal_hidden else task.goal["target"]
-        return jnp.concatenate([self._half(world), world.extra, goal])
-
-    def _half(self, world: World) -> Array:
-        """Return hand, gripper and objects (18,)."""
-        hand, left, right = world.sensors[:9].reshape(3, 3)
-        opened = jnp.clip(jnp.linalg.norm(right - left) / 0.1, 0.0, 1.0)
-        things = jnp.concatenate(self.objects(self._shown(world)))
-        return jnp.concatenate([hand, opened[None], things, jnp.zeros(_OBJECTS - things.size)])
-
-    def _shown(self, world: World) -> Observables:
-        """Return the places of the gripper and of watched things, from the sensors of ``scene.read``."""
-        left_pad, right_pad, left, right = world.sensors[9:21].reshape(4, 3)
-        poses, press = jnp.split(world.sensors[21:], [7 * len(self.watched)])
-        poses = poses.reshape(-1, 7)
-        position = dict(zip(self.watched, poses[:, :3], strict=True))
-        quat = dict(zip(self.watched, poses[:, 3:], strict=True))
-        nothing = jnp.zeros(0)
-        return Observables(
-            nothing, nothing, (left + right) / 2, left_pad, right_pad, position, quat, world.qpos, press[::3]
-        )
+        return {"success": self.evaluate(observables.at(self, task, world, action), task.goal)[1].astype(jnp.float32)}
