@@ -32,6 +32,7 @@ class Starting(Protocol):
     hand_start: tuple[float, ...]
 
     def arrange(self, host: Host, vec: np.ndarray) -> dict[str, Any]: ...
+    def vectors(self) -> np.ndarray: ...
 
 
 def name_in_metaworld(family: Any) -> str:
@@ -56,7 +57,7 @@ def starts_of_goals(family: Starting) -> tuple[Start, ...]:
     """Return how episodes of a task begin, for every goal."""
     settled = Host(compile_model(family, {})).settle(family.hand_start)
     with ThreadPoolExecutor() as pool:
-        return tuple(pool.map(partial(begin, family, settled, settled.content()), vectors(family)))
+        return tuple(pool.map(partial(begin, family, settled, settled.content()), family.vectors()))
 
 
 def of_rows(family: Any) -> tuple[Start, ...]:
