@@ -45,7 +45,7 @@ GROUPS = {  # title -> whether a family belongs there; the first that fits
     "MTEnv's own": lambda name, module: ".mtenv." in module,
     "Grids": lambda name, module: ".craft." in module,
     "Tasks that nothing shows": lambda name, module: module.endswith("envs.hidden"),
-    "Worlds whose best is known": lambda name, module: ".analytic." in module,
+    "Worlds of a few equations": lambda name, module: ".analytic." in module,
     "Hands": lambda name, module: ".dexterous." in module,
     "Mazes seen from within": lambda name, module: ".corridors." in module,
     "Meta-World": lambda name, module: ".metaworld." in module,

@@ -265,6 +265,16 @@ def test_given_values_replace_the_familys_own():
     np.testing.assert_allclose(fixed.tasks().params["size"], 1.1)
 
 
+def test_what_episodes_draw_is_told_as_a_range():
+    """And has no value in tables; tasks that are held out have one."""
+    env = envs.make("finger-spin", {"size": "0.9:1.1", "touch-size": "0.1,0.2"})
+    assert env.describe(1) == "size=0.9:1.1,touch-size=0.2"
+    assert np.isnan(env.params("train")["size"]).all() and not np.isnan(env.params("train")["touch-size"]).any()
+    row = int(env.table.rows["extrapolation"][0])
+    assert "size=0" in env.describe(row) and ":" not in env.describe(row)
+    assert not np.isnan(env.params("extrapolation")["size"]).any()
+
+
 def test_a_continuous_range_gives_every_episode_a_task_of_its_own():
     """Draws fill the range without gaps, each with its own model and context, under the identity of their task."""
     env = envs.make("finger-spin", {"size": "0.95:1.15", "touch-size": [0.03, 0.05]}, num_draws=20)

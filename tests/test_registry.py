@@ -251,6 +251,11 @@ WRONG = [
     ({"start": lambda s, t, k: (jnp.zeros(2), jnp.zeros(1))}, r"start must return positions of shape \(1,\)"),
     ({"start": lambda s, t, k: jnp.zeros(2)}, "start must return positions and velocities"),
     ({"terminates": lambda s, t, w: 1.0}, "terminates must return a bool as an array of bool, not float32"),
+    ({"control": lambda s, t, w, a: a}, "control must return the world, and the controls of the step"),
+    ({"control": lambda s, t, w, a: (w, jnp.zeros(3))}, r"control must return controls of shape \(1,\), not \(3,\)"),
+    ({"control": lambda s, t, w, a: (w, a * t.goal["gaol"])}, "control: unknown goal of the task 'gaol'"),
+    ({"metrics": lambda s, t, w, a: {"far": jnp.zeros(1)}}, r"metrics must return 'far' of shape \(\), not \(1,\)"),
+    ({"metrics": lambda s, t, w, a: jnp.zeros(1)}, "metrics must return numbers by their names"),
     ({"episode_steps": None}, "episode_steps must be a whole number of at least 1, not None"),
     (
         {"parameters": {"x": Parameter("1", 0.0, set_missing)}},
@@ -381,6 +386,24 @@ def test_every_parameter_of_the_package_changes_something(name):
     with pytest.raises(InputError, match=r"'link-length-2'\] changes nothing: reset and step do not read"):
         effects.require_effects(mtjax.make(name))
     return None
+
+
+def test_a_goal_that_only_controls_read_changes_something(spring):
+    def control(self, task, world, action):
+        return world, action + task.goal["wind"]
+
+    given = {"control": control, "parameters": {**spring.parameters, "wind": Parameter("1", 0.0, minimum=-1.0)}}
+    effects.require_effects(dataclasses.dataclass(frozen=True)(type("Windy", (spring,), given))())
+
+
+def test_a_family_of_random_tasks_takes_ranges_and_says_how_to_list_values():
+    """As a list would be drawn from like a range, without a word. A single value is for all tasks."""
+    for values in ("4:8:3", "4,6", [4.0, 6.0]):
+        with pytest.raises(InputError, match=r"sailing draws its tasks at random, .*wind-speed=lo:hi; .*combine=grid"):
+            mtjax.make("sailing", vary={"wind-speed": values})
+    listed = mtjax.make("sailing", vary={"wind-speed": "4,6"}, combine="grid")
+    assert sorted(set(listed.params("train")["wind-speed"])) == [4, 6]
+    assert set(mtjax.make("sailing", vary={"wind-speed": 5.0}).params("train")["wind-speed"]) == {5}
 
 
 def set_body_mass(spec, value):

@@ -255,6 +255,18 @@ def test_a_process_with_other_code_keeps_nothing():
         trace_cache._code()
 
 
+def test_an_error_of_a_traced_program_comes_alone():
+    """And not as one that happened while the cache said why it keeps nothing."""
+
+    class Broken:
+        def trace(self, *arguments):
+            raise KeyError("wnd")
+
+    with pytest.raises(KeyError, match="wnd") as error:
+        trace_cache.trace(None, Broken(), (), (), ())
+    assert error.value.__context__ is None
+
+
 def test_changed_source_changes_the_key(monkeypatch, tmp_path):
     """And source that changed while the process ran may not be what it runs."""
     (tmp_path / "a.py").write_text("x = 1")

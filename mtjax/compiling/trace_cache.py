@@ -70,13 +70,8 @@ def trace(env: Any, program: Any, donated: tuple[int, ...], static: tuple, argum
         static: its static arguments, which come first.
         arguments: arrays or shapes.
     """
-    try:
-        file = _file_of(program, static, arguments)
-        kept = _read(file) or _export(file, env, program, static, arguments)
-        for name, about in kept.targets.items():
-            if env.calls.provide(*about) != name:
-                raise Unkept(f"this process has another {name}")
-    except (Unkept, OSError):
+    kept = _kept(env, program, static, arguments)
+    if kept is None:
         return program.trace(*static, *arguments)
 
     def call(*arguments):
@@ -86,6 +81,19 @@ def trace(env: Any, program: Any, donated: tuple[int, ...], static: tuple, argum
 
     call.__name__ = program.__name__
     return jax.jit(call, donate_argnums=donated).trace(*arguments)
+
+
+def _kept(env: Any, program: Any, static: tuple, arguments: tuple) -> _Kept | None:
+    """Return a program from the cache, or as it is put there. Return None if it cannot be kept."""
+    try:
+        file = _file_of(program, static, arguments)
+        kept = _read(file) or _export(file, env, program, static, arguments)
+        for name, about in kept.targets.items():
+            if env.calls.provide(*about) != name:
+                raise Unkept(f"this process has another {name}")
+    except (Unkept, OSError):
+        return None
+    return kept
 
 
 # What decides a program.

@@ -309,6 +309,8 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
         require_pictures(name, unknown)
         raise _unknown_setting(name, family, unknown, settings.get(unknown))
     varied = dict(defaults.get("vary", {})) | _pairs(vary)
+    if "combine" not in settings and defaults.get("combine") == "random":
+        variation.require_ranges(name, _pairs(vary))
     return family(**checked(family, defaults | frozen(settings)) | {"vary": varied})
 
 

@@ -105,13 +105,15 @@ def _tasks(family: Family) -> Callable[[Mapping[str, float]], Parts]:
 
 
 def _leaves_read(family: Family) -> set[str]:
-    """Return the names of a task's leaves on which the results of a reset and a step depend."""
+    """Return the names of a task's leaves on which the results of a reset and a step depend, and controls."""
     task = jax.tree.map(lambda x: x[0], family.table.tasks)
     family = family.without_physics()
 
     def play(task: Task, key: Key) -> Any:
-        begun = family.reset(task, key)
-        return begun, family.step(task, begun.state, family.spec.action.blank())
+        begun, action = family.reset(task, key), family.spec.action.blank()
+        # A world that stands still reads no controls.
+        controls = family.control(task, begun.state, action) if isinstance(family, Domain) else ()
+        return begun, family.step(task, begun.state, action), controls
 
     closed = jax.make_jaxpr(play)(task, jax.random.key(0))
     _, used = dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))

@@ -21,9 +21,14 @@ def numbers(env: Any, split: str) -> np.ndarray:
 
 
 def params(env: Any, split: str) -> dict[str, Any]:
-    """Return the values (T,) of the parameters of a split's tasks; of a mixture their names as ``task_name``."""
+    """Return the values (T,) of the parameters of a split's tasks; of a mixture their names as ``task_name``.
+
+    A value is NaN where every episode draws its own.
+    """
     found = env.tasks(split).params
-    return {name: np.asarray(x) for name, x in found.items()} or {"task_name": env.labels(split)}
+    drawn = () if env.parts[0].name or split != "train" else env.variation.redrawn
+    told = {name: np.full(np.shape(x), np.nan) if name in drawn else np.asarray(x) for name, x in found.items()}
+    return told or {"task_name": env.labels(split)}
 
 
 def task_values(env: Any, split: str) -> np.ndarray:
@@ -53,11 +58,16 @@ def labels(env: Any, split: str) -> list[str]:
 
 
 def describe(env: Any, row: int) -> str:
-    """Return the task of a row as text: its varied parameters, such as "size=0.95", in a mixture after its family."""
+    """Return the task of a row as text: its varied parameters, such as "size=0.95", in a mixture after its family.
+
+    A range stands where every episode of the task draws its own value.
+    """
     part, own = owner(env, row)
     family = part.family
-    params = family.table.tasks.params
-    tell = lambda name: family.every_parameter[name].tell(float(params[name][own]), 4)
+    params, found = family.table.tasks.params, family.variation
+    drawn = found.redrawn if own < found.counts["train"] else ()
+    ranges = {name: f"{low:.4g}:{high:.4g}" for name, low, high in found.ranges if name in drawn}
+    tell = lambda name: ranges.get(name) or family.every_parameter[name].tell(float(params[name][own]), 4)
     told = ",".join(f"{name}={tell(name)}" for name in family.varied) or family.called(own)
     return _in_mixture(part, told) if part.name else told
 

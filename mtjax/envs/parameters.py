@@ -16,7 +16,7 @@ class Parameter(NamedTuple):
     unit: str
     nominal: float  # the value in the unedited model, or of a goal that does not vary
     edit: Callable[[mujoco.MjSpec, float], None] | None = None  # writes the value into a spec; None: ``Task.goal``
-    minimum: float = -math.inf  # values must be greater than this
+    minimum: float = -math.inf  # values must be greater than this, and not equal
     maximum: float = math.inf  # and not greater than this
     looks: bool = False  # whether it edits what is seen, and not the physics
     names: tuple[str, ...] = ()  # what its values 0, 1, ... are called; nothing lies between two of them

@@ -14,7 +14,7 @@ import mujoco
 from mtjax.envs.brax import Brax
 from mtjax.envs.compiled import read_model
 from mtjax.envs.domain import Domain
-from mtjax.envs.engines.base import at_rest
+from mtjax.envs.engines.base import World, at_rest
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import Parameter
 from mtjax.names import InputError, nearest_error
@@ -200,10 +200,20 @@ def _check_domain(family: Domain, task: Task, key: Any) -> None:
         _require(family, "start", what, found, (size,))
     vector: Any = lambda size: jax.ShapeDtypeStruct((size,), jnp.float32)
     world = jax.eval_shape(partial(at_rest, model), *started)
+    action = vector(family.action_size)
+    controlled = _abstract(family, "control", task, world, action)
+    if not isinstance(controlled, tuple) or len(controlled) != 2 or not isinstance(controlled[0], World):
+        raise InputError(f"{name}.control must return the world, and the controls of the step")
+    _require(family, "control", "controls", controlled[1], (model.nu,))
     obs = _abstract(family, "observe", task, world)
     _require_observation(family, "observe", obs)
-    _require(family, "reward", "a number", _abstract(family, "reward", task, world, vector(family.action_size)), ())
+    _require(family, "reward", "a number", _abstract(family, "reward", task, world, action), ())
     _require(family, "terminates", "a bool", _abstract(family, "terminates", task, world), (), jnp.bool_)
+    metrics = _abstract(family, "metrics", task, world, action)
+    if not isinstance(metrics, Mapping):
+        raise InputError(f"{name}.metrics must return numbers by their names, not {metrics!r}")
+    for named, found in metrics.items():
+        _require(family, "metrics", f"{named!r}", found, ())
 
 
 def _require_observation(family: Family, method: str, obs: Any) -> None:

@@ -124,6 +124,21 @@ def write_values(given: str | float | Sequence[float], name: str = "a parameter"
     return ",".join(repr(float(x)) for x in points)
 
 
+def require_ranges(family: str, given: Mapping[str, Any]) -> None:
+    """Refuse lists of values where a family by itself draws tasks between the ends of ranges.
+
+    Raises:
+        InputError: a parameter has several values.
+    """
+    for name, values in given.items():
+        text = write_values(values, name)
+        if "," in text or text.count(":") > 1:
+            raise InputError(
+                f"{family} draws its tasks at random, from a range such as {name}=lo:hi; for tasks with the values "
+                f"{text} add combine=grid, on a command line --env.combine=grid"
+            )
+
+
 def require_allowed(name: str, numbers: Iterable[float], parameter: Parameter) -> None:
     """Raise InputError where a number is outside a parameter's range."""
     wrong = next((x for x in numbers if not abs(x) <= _LARGEST or not _allowed(x, parameter)), None)

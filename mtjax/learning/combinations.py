@@ -58,8 +58,9 @@ def require_env(settings: Settings, env: Env, agent: Agent) -> None:
 
 
 def _draws_none(env: Env, agent: BaseAgent) -> InputError:
-    """Return the error of an agent that cannot draw a family's actions. It names agents that can."""
-    able = ", ".join(name for name, preset in AGENTS.items() if isinstance(agent.policy, preset.cls.policies))
+    """Return the error of an agent that cannot draw a family's actions. It names some agents that can."""
+    draws = lambda cls: isinstance(agent.policy, cls.policies) and not (cls.taught or cls.follows_sketches)
+    able = ", ".join([name for name, preset in AGENTS.items() if draws(preset.cls)][:3])
     families = [part.family for part in env.parts] if isinstance(env, FamilyOrMixture) else []
     scores = ", or --env.scores" * any(isinstance(family, Choosing) for family in families)
     names, kind = (agent_name_of(agent), env_name_of(env)), env.spec.action.kind

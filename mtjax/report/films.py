@@ -48,7 +48,10 @@ class Chosen(NamedTuple):
 def require(env: FamilyOrMixture) -> None:
     """Raise InputError unless a family can be filmed."""
     if not any(part.family.films for part in env.parts):
-        raise InputError("only families whose worlds can be drawn can be filmed; leave out --video")
+        raise InputError(
+            "only families whose worlds can be drawn can be filmed; leave out --video, or give your own environment of "
+            "Gymnasium a render method, and rgb_array among its metadata['render_modes']"
+        )
 
 
 def choose(env: FamilyOrMixture, splits: Sequence[str], tasks: Sequence[int]) -> list[Chosen]:
