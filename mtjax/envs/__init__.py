@@ -309,9 +309,10 @@ def make(name: str, vary: Mapping[str, Any] | tuple = (), **settings: Any) -> An
         require_pictures(name, unknown)
         raise _unknown_setting(name, family, unknown, settings.get(unknown))
     varied = dict(defaults.get("vary", {})) | _pairs(vary)
+    made = family(**checked(family, defaults | frozen(settings)) | {"vary": varied})
     if "combine" not in settings and defaults.get("combine") == "random":
         variation.require_ranges(name, _pairs(vary))
-    return family(**checked(family, defaults | frozen(settings)) | {"vary": varied})
+    return made
 
 
 def make_from(env: Any, given: Mapping[str, Any]) -> tuple[str, Any, dict[str, Any]]:

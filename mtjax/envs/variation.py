@@ -135,7 +135,7 @@ def require_ranges(family: str, given: Mapping[str, Any]) -> None:
         if "," in text or text.count(":") > 1:
             raise InputError(
                 f"{family} draws its tasks at random, from a range such as {name}=lo:hi; for tasks with the values "
-                f"{text} add combine=grid, on a command line --env.combine=grid"
+                f"{text} add --env.combine=grid"
             )
 
 
