@@ -5,6 +5,7 @@ intervals over whole seeds; fewer than three seeds have none. ``save`` writes PN
 """
 
 import math
+import textwrap
 from collections.abc import Sized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 ENDINGS = (".png", ".pdf", ".svg")
 _THRESHOLDS = 101
 _MOST_NAMED = 3  # families in a title
+_LETTERS, _KEY = 13, 6  # in an inch of a legend, and as many as the line before a name takes
 
 
 @public
@@ -64,7 +66,11 @@ def families(runs: Any = "runs/*", split: str = "train") -> "list[Axes]":
     for axes in grid[len(names) :]:
         axes.set_visible(False)
     handles = {h.get_label(): h for axes in grid for h in axes.get_lines()}
-    figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=min(len(handles), 5), frameon=False)
+    room = int(_LETTERS * figure.get_figwidth())
+    wrapped = [textwrap.fill(name, room - _KEY) for name in handles]
+    fit = room // (_KEY + max(len(line) for name in wrapped for line in name.splitlines()))
+    given = {"ncols": max(1, min(len(handles), 5, fit)), "frameon": False, "loc": "outside lower center"}
+    figure.legend(list(handles.values()), wrapped, **given)
     return list(grid[: len(names)])
 
 
