@@ -278,6 +278,7 @@ def with_preset(
     preset_name: str = "auto",
     agent_settings: Mapping[str, Any] = MappingProxyType({}),
     family: Any = None,
+    training_settings: Mapping[str, Any] = MappingProxyType({}),
     **family_settings: Any,
 ) -> RunConfig:
     """Return the configuration of a family and an agent with the tuned settings of a preset.
@@ -285,6 +286,8 @@ def with_preset(
     Args:
         agent_settings: values that replace those of the preset.
         family: the family if it is made already; by default it is made from its name and ``family_settings``.
+        training_settings: values of ``Settings`` that replace those of the preset. To as many tasks as the curriculum
+            plays at a time the preset is fitted.
         family_settings: fields of the family.
 
     Raises:
@@ -305,7 +308,7 @@ def with_preset(
     if preset_of(agent_name).cls.common_presets:
         from_pictures = table("pictures") if seen else {}
         chosen = preset.get("training", {}) | preset.get("agent", {}) | from_pictures | chosen
-    chosen = for_tasks(chosen, made.train_count, device)
+    chosen = for_tasks(chosen, Settings(**training_settings).plays.count(made.train_count), device)
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
     plan, played = preset.get("plan", {}) | take(Plan), take(Settings)
     return RunConfig(
@@ -313,14 +316,14 @@ def with_preset(
         agent=agent_name,
         preset=preset_name,  # type: ignore
         plan=Plan(**plan),
-        training=Settings(**played),
+        training=Settings(**{**played, **training_settings}),
         family=made,
         learner=agent(agent_name, **{**chosen, **agent_settings}),
     )
 
 
 def for_tasks(preset: Mapping[str, Any], count: int, device: str) -> dict[str, Any]:
-    """Return a preset's settings for ``count`` tasks; ``tuned_tasks`` says with how many it was tuned.
+    """Return a preset's settings for ``count`` tasks at a time; ``tuned_tasks`` says with how many it was tuned.
 
     A GPU steps thousands of worlds as fast as few. So there all tasks together have as many worlds, and transitions
     in a batch, as the tuned number of tasks, however many tasks there are. On a CPU an agent learns from few worlds of

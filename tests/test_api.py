@@ -167,6 +167,23 @@ def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     assert agents.settings(plain.learner)["encoder"] == "film"
 
 
+def test_a_presets_worlds_are_of_the_tasks_that_keywords_play():
+    """Whether the curriculum is given by name or inside of settings; what else is given there stays."""
+    configured = lambda **given: keywords.configured("finger-spin", "sac", {"vary": {"size": "0.9:1.1:200"}}, **given)
+    given = {"vary": {"size": "0.9:1.1:200"}, "curriculum": "random:10:4000"}
+    named = keywords.configured("finger-spin", "sac", given, plan={})
+    assert (named.training.num_envs, named.learner.experience.batch_size) == (16, 32)
+    assert named.training.curriculum == "random:10:4000"
+    inside = configured(plan={}, settings=Settings(num_envs=3, curriculum="random:10:4000"))
+    assert (inside.training.num_envs, inside.learner.experience.batch_size) == (3, 32)
+    of_all = configured(plan={})
+    assert (of_all.training.num_envs, of_all.learner.experience.batch_size) == (1, 4)
+    with pytest.raises(InputError, match="plays 1 to 200 of the 200 training tasks at a time, not 201"):
+        keywords.configured("finger-spin", "sac", given | {"curriculum": "random:201:4000"}, plan={})
+    with pytest.raises(InputError, match="curriculum"):
+        keywords.configured("finger-spin", "sac", given | {"curriculum": 4}, plan={})
+
+
 def test_an_object_that_lacks_what_is_called_is_refused(monkeypatch):
     """By the names of what it lacks."""
     monkeypatch.delattr(Probe, "ends_early")

@@ -275,6 +275,31 @@ def test_the_number_of_tasks_decides_however_it_is_given():
         assert (program.training.num_envs, program.learner.experience.batch_size) == (4, 7)
 
 
+@pytest.mark.parametrize(
+    "env, agent, preset, curriculum, sizes",
+    [
+        ("mt50", "ppo", "gpu", "all", (41, None)),
+        ("mt50", "ppo", "gpu", "sequence:20000", (2048, None)),
+        ("mt50", "sac", "gpu", "shuffled:20000", (640, 1280)),
+        ("finger-spin", "sac", "gpu", "hardest:10:20000", (256, 64)),
+        ("finger-spin", "sac", "cpu", "random:10:20000", (16, 32)),
+        ("finger-spin", "sac", "cpu", "sequence:20000", (16, 32)),
+        ("finger-spin", "sac", "cpu", "all", (1, 4)),
+    ],
+)
+def test_tasks_that_are_played_at_a_time_decide(env, agent, preset, curriculum, sizes):
+    """Not those that are known, of which the finger has two hundred; from Python as on the command line."""
+    vary = {"vary": {"size": "0.9:1.1:200"}} if env == "finger-spin" else {}
+    words = [f"--env={env}", f"--agent={agent}", f"--preset={preset}", f"--curriculum={curriculum}"]
+    words += ["--env.vary.size=0.9:1.1:200"] * bool(vary)
+    from_python = with_preset(env, agent, preset, training_settings={"curriculum": curriculum}, **vary)
+    for config in (parse(words), from_python):
+        assert (config.training.num_envs, getattr(config.learner.experience, "batch_size", None)) == sizes
+        assert config.training.curriculum == curriculum
+    given = parse([*words, "--num-envs=7"])
+    assert given.training.num_envs == 7 and given.worlds == 7 * given.played_tasks
+
+
 def test_a_short_run_is_not_all_warm_up():
     """A tenth of it is, and it has a line of metrics for each tenth; what is given holds."""
     flags = ["--env=finger-spin-vary-size", "--steps=100000"]

@@ -44,6 +44,7 @@ _BELIEVES = "ten pulls earn between 5 and 6.02; tests/test_posterior.py has beli
 _STORED = "takes over ten minutes of two CPU cores; tests/test_recurrent.py has burn-in step by step"
 _SOON = "earns nearly all that it can before its first evaluation; tests/test_pqn.py has probes"
 _ON = "minutes of a GPU, by benchmarks/resets.py; tests/test_tabletop.py plays such worlds"
+_KEEPS = "tests/test_remembering.py measures what it keeps"
 _CRAFT = "takes longer than ten minutes of two CPU cores; tests/test_sketches.py learns in a small corridor"
 _PAGE = "is --quick with a page; tests/test_view.py has a run with one"
 _LOOP = "--env=point-mass-vary-goal --agent=multi-head"  # one pair of the loop around the command
@@ -66,12 +67,12 @@ MARKS: dict[str, Learns | str] = {
     "--env=sailing --agent=ppo": Learns(2),
     "--env=tabletop --agent=ppo --reset-free --curriculum=forward-backward": _ON,
     "--env=point-mass-vary-goal --env.num-tasks=4 --split=none --agent=sac --agent.conditioning=one-hot "
-    "--agent.normalize-observations=false --num-envs=8 --chunk-steps=500 --curriculum=sequence:2000 --steps=64000 "
-    "--agent.continual=packnet --agent.retrain-updates=2000": "tests/test_remembering.py measures what it keeps",
+    "--agent.normalize-observations=false --num-envs=8 --batch-size=32 --chunk-steps=500 --curriculum=sequence:2000 "
+    "--steps=64000 --agent.continual=packnet --agent.retrain-updates=2000": _KEEPS,
     "--env=walker-walk --env.vary.friction=0.1:2:20 --split=none --agent=ppo --agent.conditioning=none "
-    "--curriculum=sequence:100000 --chunk-steps=10000 --agent.plasticity=continual-backprop": _WALKER,
+    "--num-envs=103 --curriculum=sequence:100000 --chunk-steps=10000 --agent.plasticity=continual-backprop": _WALKER,
     "--env=cw10 --agent=brc --agent.conditioning=one-hot --agent.heads=per-task --num-envs=256 "
-    "--curriculum=sequence:3000 --chunk-steps=750 --steps=7680000 --agent.continual=clone": _GPU,
+    "--batch-size=64 --curriculum=sequence:3000 --chunk-steps=750 --steps=7680000 --agent.continual=clone": _GPU,
     "--env=errands --agent=ppo --agent.conditioning=text --agent.encoder=film": _READS,
     "--env=bandit --agent=pqn": _SOON,
     "--env=gymnasium:CartPole-v1 --agent=ppo": _GYM,
@@ -94,7 +95,7 @@ MARKS: dict[str, Learns | str] = {
     "--agent.recurrent-size=32 --agent.inference-widths 32 32 --agent.decoded-steps=6 --agent.hidden 64 64 "
     "--agent.unroll=18 --agent.gamma=0.97 --agent.entropy-cost=0.02 --agent.actor-lr=1e-3 --num-envs=128 "
     "--chunk-steps=180 --steps=600000 --eval-every=200000 --eval-episodes=30": _FOUND,
-    "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000 --num-envs=8": _FINGER,
+    "--env=finger-spin --env.vary.size=0.95:1.13:200 --curriculum=random:10:4000": _FINGER,
     "--env=gymnasium:Pendulum-v1 --env.vary.g=5:15:5 --agent=ppo": _GYM,
     "--env=mt10 --agent=multi-head": _GPU,
     "--env=mt10 --agent=care --agent.num-experts=4 --agent.conditioning=text --agent.text=all-MiniLM-L6-v2 "

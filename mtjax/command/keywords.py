@@ -59,11 +59,11 @@ def configured(
     of_agent = {key: value for key, value in rest.items() if key not in _names(Settings)}
     _require_known(of_agent, agent, name, family, isinstance(env, str))
     if isinstance(agent, str):
-        config = with_preset(name, agent, "auto", {**(begun.settings if begun else {}), **of_agent}, family)
-        training = dataclasses.replace(settings or config.training, **{x: rest[x] for x in rest.keys() - of_agent})
+        of_loop = {**(vars(settings) if settings else {}), **{x: rest[x] for x in rest.keys() - of_agent}}
+        config = with_preset(name, agent, "auto", {**(begun.settings if begun else {}), **of_agent}, family, of_loop)
         length = dataclasses.replace(config.plan if isinstance(env, str) else Plan(), **plan)
         chosen = {x for x in plan if plan[x] != getattr(Plan, x)} | {*given, *(_names(Settings) if settings else ())}
-        config = fit_length(dataclasses.replace(config, plan=length, training=training), chosen)
+        config = fit_length(dataclasses.replace(config, plan=length), chosen)
     else:
         learner, training = configure(agent, settings or Settings(), rest)
         names = (name, agents.name_of(learner)) if named else ("", "")

@@ -65,8 +65,9 @@ def draft(argv: Sequence[str]) -> RunConfig:
     if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse
         deciding["normalize_observations"] = False
     begun = beginning(preset_of(agent_name).cls, sources[0].learner, sources[0].family) if sources else None
-    asked = {} if begun is None else begun.settings
-    default = with_preset(env_name, agent_name, preset_name, {**asked, **chosen, **deciding}, vary=vary, **of_family)
+    of_agent = {**({} if begun is None else begun.settings), **chosen, **deciding}
+    of_loop = _of_loop(argv)
+    default = with_preset(env_name, agent_name, preset_name, of_agent, None, of_loop, vary=vary, **of_family)
     if sources and begun is None:
         taught = preset_of(agent_name).cls.taught
         default = _distilling(default, sources) if taught else _fine_tuning(default, sources[0], chosen)
@@ -76,6 +77,13 @@ def draft(argv: Sequence[str]) -> RunConfig:
     config = fit_length(config, {name for word in argv if (name := _name(word))})
     config = dataclasses.replace(config, imports=tuple(files))
     return dataclasses.replace(config, imports=own_files(config))
+
+
+def _of_loop(argv: Sequence[str]) -> dict[str, Any]:
+    """Return those settings of the loop on a command line to which presets are fitted."""
+    curriculum, worlds = flag_value(argv, "curriculum", ""), flag_value(argv, "num-envs", "")
+    given: dict[str, Any] = {"curriculum": curriculum} if curriculum else {}
+    return given | ({"num_envs": int(worlds)} if worlds.isdecimal() else {})
 
 
 def _name(word: str) -> str:
