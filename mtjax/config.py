@@ -25,6 +25,7 @@ from mtjax.agents.teacher import Teacher
 from mtjax.checks import MOST_EPISODES, check_fields, path, require_counts, require_not_negative, require_text
 from mtjax.envs import make
 from mtjax.envs.mixtures import FamilyOrMixture
+from mtjax.experience import Rollouts
 from mtjax.learning import combinations, populations, trials
 from mtjax.learning.loop import Settings
 from mtjax.names import PRESETS, nearest_error, public
@@ -286,8 +287,8 @@ def with_preset(
     Args:
         agent_settings: values that replace those of the preset.
         family: the family if it is made already; by default it is made from its name and ``family_settings``.
-        training_settings: values of ``Settings`` that replace those of the preset. To as many tasks as the curriculum
-            plays at a time the preset is fitted.
+        training_settings: values of ``Settings`` that replace those of the preset. The preset is fitted to as many
+            tasks as their curriculum plays at a time.
         family_settings: fields of the family.
 
     Raises:
@@ -311,7 +312,7 @@ def with_preset(
     chosen = for_tasks(chosen, Settings(**training_settings).plays.count(made.train_count), device)
     take = lambda cls: {name: chosen.pop(name) for name in list(chosen) if name in cls.__dataclass_fields__}
     plan, played = preset.get("plan", {}) | take(Plan), take(Settings)
-    return RunConfig(
+    config = RunConfig(
         env=env_name,
         agent=agent_name,
         preset=preset_name,  # type: ignore
@@ -320,6 +321,7 @@ def with_preset(
         family=made,
         learner=agent(agent_name, **{**chosen, **agent_settings}),
     )
+    return fit_minibatches(config, {*agent_settings, *training_settings})
 
 
 def for_tasks(preset: Mapping[str, Any], count: int, device: str) -> dict[str, Any]:
@@ -344,6 +346,29 @@ def for_tasks(preset: Mapping[str, Any], count: int, device: str) -> dict[str, A
     return chosen | {name: share(chosen[name] * tuned, least) for name, least in _LEAST.items() if name in chosen}
 
 
+def fit_minibatches(config: RunConfig, given: Collection[str]) -> RunConfig:
+    """Return a configuration whose minibatches share whole windows, if each window is all of a world's rollout.
+
+    An agent with a memory has a window for each world of a task, and a pass leaves out those that do not divide evenly.
+    So a minibatch has the least whole number of windows with which there are no more minibatches than asked for, and
+    there are as many worlds as the minibatches take: 42 in 14 for 41 in 16.
+
+    Args:
+        given: names of settings that somebody chose, which stay as they are.
+    """
+    rollouts, num_envs = config.learner.experience, config.training.num_envs
+    if not isinstance(rollouts, Rollouts) or not config.learner.unroll:
+        return config
+    size, count = math.ceil(num_envs / rollouts.minibatches), rollouts.minibatches
+    if "minibatches" not in given:
+        count = min(count, num_envs if "num_envs" in given else math.ceil(num_envs / size))
+    training = config.training
+    if "num_envs" not in given:
+        training = dataclasses.replace(training, num_envs=size * count)
+    learner = dataclasses.replace(config.learner, experience=dataclasses.replace(rollouts, minibatches=count))
+    return dataclasses.replace(config, training=training, learner=learner)
+
+
 def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) -> Settings:
     """Return settings whose chunks, each a multiple of ``grain`` steps, make a run hardly longer than ``steps``.
 
@@ -363,7 +388,7 @@ def fit_chunk(settings: Settings, num_tasks: int, steps: int, grain: int = 1) ->
 
 
 def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
-    """Return a configuration whose warm-up, chunks and evaluations fit a short run.
+    """Return a configuration whose warm-up, chunks and evaluations fit a short run, and whose minibatches its worlds.
 
     Random actions take at most a tenth of the run, and so does a chunk. All evaluations together play at most three
     times as many steps on training tasks as the run, but there is one at the end. They play whole trials.
@@ -371,6 +396,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
     Args:
         given: names of settings that somebody chose, which stay as they are.
     """
+    config = fit_minibatches(config, given)
     plan, training, experience = config.plan, config.training, config.learner.experience
     count = config.played_tasks
     tenth = plan.steps // (10 * count * training.num_envs)

@@ -140,6 +140,16 @@ def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
         (["--agent.value=c51"], {"value": "c51"}, "value=c51 reaches returns from -10 to 10"),
         (["--agent.continual=ewc"], {"continual": "ewc"}, "use --curriculum=sequence:STEPS"),
         (["--trials=2", "--hindsight=0.5"], {"trials": 2, "hindsight": 0.5}, "use --hindsight=0 or --trials=1"),
+        (
+            ["--agent=rl2", "--num-envs=2", "--agent.minibatches=4"],
+            {"agent": "rl2", "num_envs": 2, "minibatches": 4},
+            "minibatches=4 are too many: .* a task has 2; use --agent.minibatches=2, or --num-envs=4",
+        ),
+        (
+            ["--agent=ppo", "--num-envs=2", "--agent.unroll=4", "--agent.minibatches=9"],
+            {"agent": "ppo", "num_envs": 2, "unroll": 4, "minibatches": 9},
+            "minibatches=9 are too many: a task's rollout has 8 steps; use --agent.minibatches=8$",
+        ),
     ],
 )
 def test_a_configuration_is_checked_where_it_is_made(words, given, said, monkeypatch):
@@ -148,8 +158,9 @@ def test_a_configuration_is_checked_where_it_is_made(words, given, said, monkeyp
     with pytest.raises(InputError, match=said):
         run_config.parse(["--env=point-mass-vary-goal", "--agent=sac", *words])
     plan = {name: given.pop(name) for name in ("eval_episodes", "population") if name in given}
+    agent = given.pop("agent", "sac")
     with pytest.raises(InputError, match=said):
-        keywords.configured("point-mass-vary-goal", "sac", given, plan=plan)
+        keywords.configured("point-mass-vary-goal", agent, given, plan=plan)
     run_config.parse(["--env=point-mass-vary-goal", "--agent=sac"])
 
 

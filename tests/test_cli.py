@@ -300,6 +300,40 @@ def test_tasks_that_are_played_at_a_time_decide(env, agent, preset, curriculum, 
     assert given.training.num_envs == 7 and given.worlds == 7 * given.played_tasks
 
 
+@pytest.mark.parametrize(
+    "device, count, sizes",
+    [
+        *(("cpu", 10, (32, 4)), ("cpu", 50, (8, 4)), ("cpu", 200, (2, 2))),
+        *(("gpu", 1, (2048, 16)), ("gpu", 10, (208, 16)), ("gpu", 50, (42, 14)), ("gpu", 200, (11, 11))),
+    ],
+)
+@pytest.mark.parametrize("memory", ["rl2", "ppo"])
+def test_a_memorys_minibatches_share_whole_rollouts_of_worlds(memory, device, count, sizes):
+    """None is left out, and worlds and minibatches stay near those of single steps."""
+    given = {"conditioning": "transformer"} if memory == "ppo" else {}
+    config = with_preset("point-mass-vary-goal", memory, device, given, num_tasks=count, split="none")
+    assert (config.training.num_envs, config.learner.experience.minibatches) == sizes
+    plain = with_preset("point-mass-vary-goal", "ppo", device, num_tasks=count, split="none")
+    asked = plain.training.num_envs, plain.learner.experience.minibatches
+    assert asked[0] <= sizes[0] <= asked[0] + 3 and sizes[1] <= asked[1]
+
+
+@pytest.mark.parametrize(
+    "words, sizes",
+    [
+        (["--num-envs=41"], (41, 16)),
+        (["--num-envs=2"], (2, 2)),
+        (["--agent.minibatches=16"], (48, 16)),
+        (["--num-envs=41", "--agent.minibatches=16"], (41, 16)),
+    ],
+)
+def test_what_is_given_of_worlds_and_minibatches_stays(words, sizes):
+    """Of the other there are enough."""
+    env = ["--env=point-mass-vary-goal", "--env.num-tasks=50", "--split=none", "--agent=rl2"]
+    config = parse([*env, "--preset=gpu", *words])
+    assert (config.training.num_envs, config.learner.experience.minibatches) == sizes
+
+
 def test_a_short_run_is_not_all_warm_up():
     """A tenth of it is, and it has a line of metrics for each tenth; what is given holds."""
     flags = ["--env=finger-spin-vary-size", "--steps=100000"]

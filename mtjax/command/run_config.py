@@ -87,8 +87,9 @@ def _of_loop(argv: Sequence[str]) -> dict[str, Any]:
 
 
 def _name(word: str) -> str:
-    """Return the setting of a flag, such as chunk_steps of --chunk-steps=100; an empty string for other words."""
-    return word.split("=", 1)[0].removeprefix("--").replace("-", "_") if word.startswith("--") else ""
+    """Return the setting of a flag, such as unroll of --agent.unroll=32; an empty string for other words."""
+    flag = word.split("=", 1)[0].removeprefix("--").removeprefix("agent.")
+    return flag.replace("-", "_") if word.startswith("--") else ""
 
 
 def _sources(start: str, agent_name: str) -> list[RunConfig]:

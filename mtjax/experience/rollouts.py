@@ -28,7 +28,8 @@ class Rollouts:
     epochs: int = 4
     """Passes over the rollout."""
     minibatches: int = 8
-    """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass."""
+    """Minibatches in each pass; steps that do not divide evenly are left out, other ones in each pass. An agent with a
+    memory divides worlds, as it learns from whole rollouts of these."""
 
     storage: ClassVar[Storage] = Storage(axes=0, sharding=(), kept=False, flags=("num-envs",))
     policy_delay: ClassVar[int] = 1  # the actor learns in every update
@@ -82,6 +83,10 @@ class Rollouts:
         """Return the latest steps, leaves (S, T, H, E, ...)."""
         return steps
 
+    def num_windows(self, num_envs: int, length: int) -> int:
+        """Return how many windows a task's rollout has of so many steps; 0 is for single steps."""
+        return self.unroll // (length or 1) * num_envs
+
     # Learning.
 
     def batches(self, env: Env, agent: Any, tasks: Task, data: Transition, key: Key, state: Any = None) -> Array:
@@ -91,7 +96,7 @@ class Rollouts:
             InputError: there are fewer windows than minibatches.
         """
         num_envs, length = data.reward.shape[2], agent.unroll or 1  # then the first steps are the first num_envs
-        first = self.shuffled(self.unroll // length * num_envs, key)
+        first = self.shuffled(self.num_windows(num_envs, agent.unroll), key)
         return first[..., None] + num_envs * jnp.arange(length)
 
     def shuffled(self, count: int, key: Key) -> Array:

@@ -13,16 +13,18 @@ from mtjax.envs import name_of as env_name_of
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.engines.base import World
 from mtjax.envs.mixtures import FamilyOrMixture
+from mtjax.experience import Rollouts
 from mtjax.learning.loop import Settings
 from mtjax.types import Agent, Env, InputError, Returning
 
 
 def require_agent(settings: Settings, agent: Agent) -> None:
-    """Check that an agent can learn from the trials, and from the tasks at a time, that settings ask for.
+    """Check that an agent can learn from the trials, the worlds and the tasks at a time that settings ask for.
 
     Raises:
         InputError: it cannot.
     """
+    _require_windows(settings.num_envs, agent)
     if settings.trials > 1:
         _require_repeatable(settings.trials, agent)
     if consolidates(agent) and not settings.plays.in_turn:
@@ -65,6 +67,17 @@ def _draws_none(env: Env, agent: BaseAgent) -> InputError:
     scores = ", or --env.scores" * any(isinstance(family, Choosing) for family in families)
     names, kind = (agent_name_of(agent), env_name_of(env)), env.spec.action.kind
     return InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
+
+
+def _require_windows(num_envs: int, agent: Agent) -> None:
+    """Refuse more minibatches than a task's rollout has windows, which for a memory are whole rollouts of worlds."""
+    rollouts, length = agent.experience, agent.unroll
+    if not isinstance(rollouts, Rollouts) or rollouts.minibatches <= rollouts.num_windows(num_envs, length):
+        return
+    count, asked = rollouts.num_windows(num_envs, length), rollouts.minibatches
+    whole = f"this agent learns from whole rollouts of worlds, and a task has {count}"
+    told, worlds = (whole, f", or --num-envs={asked}") if length else (f"a task's rollout has {count} steps", "")
+    raise InputError(f"--agent.minibatches={asked} are too many: {told}; use --agent.minibatches={count}{worlds}")
 
 
 def _require_turns(settings: Settings, agent: Agent) -> None:
