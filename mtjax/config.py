@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from mtjax.agents import BaseAgent, agent, preset_of, settings, tuned_as
 from mtjax.agents import name_of as agent_name_of
-from mtjax.agents.hyperparameters import kinds_of, replace, require_value_range
+from mtjax.agents.hyperparameters import kinds_of, of_record, replace, require_value_range
 from mtjax.agents.parts.policies import Gaussian, policy_for
 from mtjax.agents.rates import planned
 from mtjax.agents.swept import agents_at
@@ -458,7 +458,8 @@ def _with_teacher(learner: Any, record: Mapping[str, Any] | None, env: Any) -> A
     """Return the agent with the teacher that a record describes, if there is one."""
     if record is None:
         return learner
-    made = _with_policy(agent(record["agent"], **record["settings"]), env)
+    own = of_record(preset_of(record["agent"]).cls, record["settings"])
+    made = _with_policy(agent(record["agent"], **own), env)
     teacher = Teacher(made, *(record[size] for size in ("tasks", "context", "runs")))
     return dataclasses.replace(learner, teacher=teacher)
 

@@ -423,4 +423,4 @@ def test_settings_that_make_no_sense_are_refused(name, settings, message):
 def test_agents_are_static_under_jit(name):
     """Two agents with the same settings are one program."""
     assert hash(tiny(name)) == hash(tiny(name)) and tiny(name) == tiny(name)
-    assert tiny(name) != tiny(name, gamma=0.5)
+    assert tiny(name) != tiny(name, weight_decay=0.5)

@@ -1,6 +1,7 @@
 """Distillation: the loss by hand, who teaches which task, learners that come to act as taught, and what is refused."""
 
 import dataclasses
+import json
 import math
 import shutil
 
@@ -15,7 +16,9 @@ import mtjax
 import mtjax.train
 from mtjax.agents import for_action
 from mtjax.agents.distil import Batch, teaching
+from mtjax.agents.hyperparameters import flag_names
 from mtjax.agents.state import of_task
+from mtjax.agents.swept import sweepable
 from mtjax.agents.teacher import Teacher
 from mtjax.command import run_config
 from mtjax.learning.evaluation import Episodes, evaluate
@@ -283,6 +286,10 @@ def test_a_record_tells_who_teaches(tmp_path):
     first, second, third = (from_json(folder / "config.json") for folder in (run, taught, again))
     assert second.learner.teacher == Teacher(first.learner, 3, 1, 2)
     assert third.agent == "distil" and third.learner.teacher.agent.teacher is None
+    record = json.loads((again / "config.json").read_text())
+    record["teacher"]["settings"] |= OF_CRITICS | OF_REWARDS  # which it had before
+    (again / "config.json").write_text(json.dumps(record))
+    assert from_json(again / "config.json").learner == third.learner
 
 
 @pytest.mark.slow
@@ -338,6 +345,20 @@ def test_policies_of_other_shapes_do_not_teach():
     for runs, said in refused.items():
         with pytest.raises(InputError, match=said):
             train_objects(env, tiny("distil"), start=runs)
+
+
+OF_CRITICS = {"critic_lr": 9.0, "critic_hidden": (7,), "critic_heads": "per-task", "critic_layer_norm": False}
+OF_REWARDS = {"gamma": 0.5, "discounting": "horizon"}
+
+
+@pytest.mark.parametrize(("name", "value"), (OF_CRITICS | OF_REWARDS).items())
+def test_it_has_no_settings_of_critics_and_rewards(name, value):
+    """As nothing would read them; neither in Python, nor on a command line, nor in a sweep."""
+    with pytest.raises(InputError, match=f"unknown setting of distil '{name}'"):
+        mtjax.agent("distil", **{name: value})
+    agent = mtjax.agent("distil")
+    assert f"agent.{name.replace('_', '-')}" not in flag_names(agent).values()
+    assert name not in agent.adjustable and name not in sweepable(agent)
 
 
 def test_an_agent_without_teachers_is_refused():

@@ -1,6 +1,7 @@
 """PQN: its targets by hand, exploration that falls, masks, and tabular processes against value iteration."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,12 @@ from test_ppo import random_steps
 import mtjax
 from mtjax import agents
 from mtjax.agents import for_action
+from mtjax.agents.swept import sweepable
+from mtjax.agents.unseen_tasks import describe_unseen
+from mtjax.command import run_config
+from mtjax.config import with_preset
 from mtjax.envs.probes import Probe
+from mtjax.saved.config_json import from_json, to_json
 from mtjax.types import Discrete, InputError, Spec
 
 SPEC = Spec.vector(3, 2, 1)._replace(action=Discrete(4))
@@ -147,6 +153,36 @@ def test_greedy_actions_are_those_of_value_iteration():
 def test_settings_that_make_no_sense_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         agents.agent("pqn", **settings)
+
+
+OF_AN_ACTOR = {"actor_lr": 9.0, "actor_hidden": (7,), "actor_heads": "per-task", "actor_layer_norm": True}
+
+
+@pytest.mark.parametrize("name", OF_AN_ACTOR)
+def test_it_has_no_settings_of_an_actor(name):
+    """As nothing would read them; neither in Python, nor on a command line, nor in a sweep."""
+    with pytest.raises(InputError, match=f"unknown setting of pqn '{name}'"):
+        agents.agent("pqn", **{name: OF_AN_ACTOR[name]})
+    flag = f"--agent.{name.replace('_', '-')}"
+    assert flag not in run_config.flags(with_preset("bandit", "pqn"))
+    assert name not in agents.agent("pqn").adjustable and name not in sweepable(agents.agent("pqn"))
+
+
+def test_records_of_when_it_had_them_are_read(tmp_path):
+    """As they were of no effect."""
+    config, file = with_preset("bandit", "pqn"), tmp_path / "config.json"
+    record = json.loads(to_json(config, {"command": "x"}))
+    assert not record["learner"].keys() & OF_AN_ACTOR
+    file.write_text(json.dumps(record | {"learner": record["learner"] | OF_AN_ACTOR}))
+    assert from_json(file) == config
+    file.write_text(json.dumps(record | {"learner": record["learner"] | {"actor_rate": 1}}))
+    with pytest.raises(InputError, match="unknown setting of pqn 'actor_rate'"):
+        from_json(file)
+
+
+def test_an_unseen_task_uses_the_critic_of_the_nearest():
+    """As that acts."""
+    assert describe_unseen(agents.agent("pqn", critic_heads="per-task")).startswith("each uses the head of the nearest")
 
 
 def test_continuous_actions_are_refused():

@@ -3,14 +3,14 @@
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import tyro
 
 from mtjax.agents import parts
-from mtjax.agents.base import BaseAgent, Inputs, Memory
+from mtjax.agents.base import BaseAgent, HeadsOfOne, Inputs, Memory
 from mtjax.agents.fit import Fit, descend
 from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.networks import Params
@@ -58,7 +58,7 @@ class Distil(BaseAgent):
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
-        *BaseAgent.adjustable,
+        *(name for name in BaseAgent.adjustable if name not in ("critic_lr", "gamma")),
         *("epochs", "minibatches", "teacher_temperature", "teacher_share"),
     )
     common_presets: ClassVar[bool] = False
@@ -66,6 +66,12 @@ class Distil(BaseAgent):
     devices_differ: ClassVar[bool] = True
     taught: ClassVar[bool] = True
     in_training: ClassVar[Mapping[str, Any]] = MappingProxyType({"teacher": None})
+    critic_lr: ClassVar[float] = BaseAgent.critic_lr  # no setting, as the next three: there are no critics
+    critic_hidden: ClassVar[tuple[int, ...]] = ()
+    critic_heads: ClassVar[HeadsOfOne] = "as-heads"
+    critic_layer_norm: ClassVar[bool] = False
+    gamma: ClassVar[float] = BaseAgent.gamma  # no setting, as the next: no rewards are learned from
+    discounting: ClassVar[Literal["gamma", "horizon"]] = "gamma"
     normalize_observations: bool = True
     """Scale observations to mean 0 and variance 1, by moments of training data alone, and clip them to +-10."""
     max_gradient_norm: float = 1.0

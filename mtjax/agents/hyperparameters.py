@@ -131,6 +131,15 @@ def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str,
     return cls(**checked(cls, rest), **chosen)
 
 
+def of_record(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an agent's settings from a record, without those that other agents have and its class does not.
+
+    Agents had them for a while though nothing read them, and so have records of that time.
+    """
+    lacking = cls.__dataclass_fields__.keys() - {field.name for field in dataclasses.fields(cls)}
+    return {name: value for name, value in given.items() if name not in lacking}
+
+
 def unknown_setting(kind: str, name: str, known: Iterable[str]) -> InputError:
     """Return an error for a setting that an agent lacks. It names who has that setting, else the nearest match."""
     found = owners(name, "{}={!r}")

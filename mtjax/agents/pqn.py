@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import parts
-from mtjax.agents.base import BaseAgent, Inputs, Memory
+from mtjax.agents.base import BaseAgent, HeadsOfOne, Inputs, Memory
 from mtjax.agents.fit import Fit, Losses, descend
 from mtjax.agents.hyperparameters import FLAT
-from mtjax.agents.networks import Params
+from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.policies.categorical import allowed
@@ -52,12 +52,16 @@ class PQN(BaseAgent):
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
-        *BaseAgent.adjustable,
+        *(name for name in BaseAgent.adjustable if name != "actor_lr"),
         *("q_lambda", "epochs", "minibatches", "epsilon", "epsilon_rollouts"),
     )
     common_presets: ClassVar[bool] = False
     policies: ClassVar[tuple[type[Policy], ...]] = (Categorical,)
     devices_differ: ClassVar[bool] = True
+    actor_lr: ClassVar[float] = BaseAgent.actor_lr  # no setting, as the next three: there is no actor
+    actor_hidden: ClassVar[tuple[int, ...]] = ()
+    actor_heads: ClassVar[HeadsOfOne] = "as-heads"
+    actor_layer_norm: ClassVar[bool] = False
     critic_lr: float = 5e-4
     """Adam's learning rate for the critic."""
     max_gradient_norm: float = 10.0
@@ -88,6 +92,11 @@ class PQN(BaseAgent):
     def init_networks(self, state: AgentState, inputs: Inputs, key: Key) -> AgentState:
         critic = self.critic.init(key, state.num_tasks, len(inputs.action), *inputs.critic)
         return state.with_nets(critic=critic, exploration=Params({"rollouts": jnp.int32(0)}, {}))
+
+    @property
+    def actor(self) -> Network:
+        """The network that acts, which is the critic."""
+        return self.critic
 
     @property
     def fits(self) -> dict[str, Fit]:

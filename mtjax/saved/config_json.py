@@ -13,8 +13,8 @@ from typing import Any
 import jax
 
 from mtjax import __version__
-from mtjax.agents import AGENTS, agent, settings
-from mtjax.agents.hyperparameters import flag_names, replace
+from mtjax.agents import AGENTS, agent, preset_of, settings
+from mtjax.agents.hyperparameters import flag_names, of_record, replace
 from mtjax.checks import require_run, require_values
 from mtjax.config import Plan, RunConfig
 from mtjax.envs import ENVS, is_mixture, make
@@ -112,7 +112,7 @@ def _from_record(record: Any) -> RunConfig:
         trackio=record.get("trackio", ""),
         plan=Plan(**record["plan"]),
         training=Settings(**record["training"]),
-        learner=agent(record["agent"], **record["learner"]),
+        learner=agent(record["agent"], **of_record(preset_of(record["agent"]).cls, record["learner"])),
         family=make(record["env"], **record["family"]),
     )
     require_values(config)
