@@ -179,6 +179,7 @@ class Task(NamedTuple):
     action_mask: Array | None = None  # (A,) 1 for actions, or choices, that the task has, else 0; None: it has all
     blocks: Any = None  # in a mixture, which tasks belong to which family; static, without leaves
     scene: dict[str, Array] | None = None  # only what differs between tasks in what is seen; None without pixels
+    finite_horizon: Array | None = None  # () bool, where a mixture's families differ in it; None: as the environment's
 
     def __repr__(self) -> str:
         """Return a line: the number of tasks, and the values of their parameters where they are known."""

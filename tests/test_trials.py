@@ -11,6 +11,7 @@ from test_loop import Drifting
 
 import mtjax
 from mtjax.agents.parts import targets
+from mtjax.envs.mtenv.tabular import TabularMDP
 from mtjax.experience import multistep
 from mtjax.learning import loop
 from mtjax.learning.evaluation import (
@@ -133,6 +134,43 @@ def test_a_trial_is_terminal_where_its_length_is_part_of_the_problem():
     """Whatever ends its last episode."""
     rows, *_ = play(Finite())
     np.testing.assert_array_equal(rows.discount, 1.0 - rows.closed)
+
+
+@dataclasses.dataclass(frozen=True)
+class Brief(TabularMDP):
+    """Processes that a limit of time cuts off after four steps."""
+
+    episode_steps = 4
+
+
+class Still(Stub):
+    """Finds all five choices alike."""
+
+    def choose(self, state, obs, task, key):
+        return jnp.zeros(5)
+
+
+@pytest.mark.parametrize("curriculum", ["all", "sequence:60"])
+def test_a_mixtures_limit_is_part_of_the_problem_in_those_families_alone_where_it_is(curriculum):
+    """As in each of them by itself: sums of rewards run through a trial there, and are cut elsewhere."""
+    grid, table = mtjax.make("grid-navi", size=3, steps=3, scores=True), Brief(scores=True, num_tasks=1)
+    settings = {**SETTINGS, "warmup_steps": 1, "trials": 2, "curriculum": curriculum}
+    state, _ = train(mtjax.mixture([grid, table]), Still(), settings)
+    rows = state.data.ring.rows
+    for i, finite in enumerate([True, False][: len(rows.ended[0])]):
+        ended, closed = rows.ended[0, i], rows.closed[0, i]
+        assert closed.any() and (ended & ~closed).any()
+        np.testing.assert_array_equal(rows.discount[0, i], 1.0 - (closed & finite))
+        np.testing.assert_array_equal(rows.cut[0, i], closed if finite else ended)
+
+
+def test_tasks_tell_of_a_finite_horizon_only_where_families_differ():
+    """Else the environment does, and programs have no data of it."""
+    grid, longer, table = mtjax.make("grid-navi"), mtjax.make("grid-navi", steps=20), mtjax.make("tabular-mdp")
+    for families, finite in (([grid, longer], True), ([table, mtjax.make("errands")], False)):
+        mixed = mtjax.mixture(families)
+        assert mixed.finite_horizon is finite and mixed.tasks().finite_horizon is None
+    np.testing.assert_array_equal(mtjax.mixture([grid, table]).tasks().finite_horizon, [True] + [False] * 10)
 
 
 def test_what_follows_inside_a_trial_is_the_next_episode_unless_a_limit_cuts_sums_off(drifting):

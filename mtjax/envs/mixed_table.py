@@ -32,6 +32,7 @@ def mixed_table(families: Sequence[Family], action_size: int) -> Table:
         "goal": {},
         "horizon": np.concatenate([table.tasks.horizon for table in tables]),
         "action_mask": _masks(families, action_size),
+        "finite_horizon": _finite(families),
     }
     return Table(Task(**leaves), rows, _draws(tables, first, count), blocks_of([family.counts for family in families]))
 
@@ -61,6 +62,12 @@ def _masks(families: Sequence[Family], size: int) -> np.ndarray | None:
         masks.append(np.ones(shape, np.float32) if own is None else np.float32(own))
     whole = np.concatenate([np.pad(x, ((0, 0), (0, size - x.shape[1]))) for x in masks])
     return None if np.all(whole == 1) else whole
+
+
+def _finite(families: Sequence[Family]) -> np.ndarray | None:
+    """Return whose limits of time (R,) are part of the problem; None if those of all families are, or of none."""
+    rows = [np.full(len(family.table.tasks.id), family.finite_horizon) for family in families]
+    return None if len({family.finite_horizon for family in families}) == 1 else np.concatenate(rows)
 
 
 def _draws(tables: Sequence[Table], first: np.ndarray, count: int) -> np.ndarray | None:

@@ -92,7 +92,7 @@ class Mixture:
 
     @property
     def finite_horizon(self) -> bool:
-        """Return whether how long an episode is, is part of the problem in all families."""
+        """Return whether the limit of time is part of the problem in all families. Tasks say it where they differ."""
         return all(family.finite_horizon for family in self.families)
 
     @property

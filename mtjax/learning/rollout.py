@@ -176,7 +176,9 @@ def step_envs(
     obs = where_worlds(lost, worlds.obs, frames.push(worlds.obs, step.obs))
     age = worlds.age + 1
     timeout = age >= each.horizon
-    terminated = step.terminated | timeout if env.finite_horizon else step.terminated
+    final = timeout if each.finite_horizon is None else timeout & each.finite_horizon
+    finite = env.finite_horizon or each.finite_horizon is not None
+    terminated = step.terminated | final if finite else step.terminated
     timeout = timeout if step.truncated is None else timeout | step.truncated
     ends = trials.ends(terminated & ~lost, timeout, lost, worlds.episode)
     transition = Transition(
