@@ -1,6 +1,7 @@
 """Curricula: which of the known tasks are played, and what that leaves of the others."""
 
 import csv
+import itertools
 from functools import partial
 
 import jax
@@ -54,6 +55,14 @@ def test_a_random_choice_repeats_no_task_and_changes():
     assert all(len(set(rows.tolist())) == 3 for rows in drawn)
     counts = np.bincount(np.concatenate(drawn), minlength=10)
     assert counts.sum() == 600 and np.all(np.abs(counts - 60) < 30)
+
+
+@pytest.mark.parametrize("text", ["random:3:1", "hardest:3:1", "progress:3:1", "growing:3:1:1000"])
+def test_a_choice_is_in_the_order_of_the_table(text):
+    """So the same tasks are the same rows: all three of three, and the middle three of five that never grow."""
+    curriculum, known = curricula.read(text), 5 if text.startswith("growing") else 3
+    choose = lambda step: np.asarray(curriculum.rows(jnp.int32(step), known)).tolist()
+    assert {tuple(choose(step)) for step in range(20)} == {(1, 2, 3) if known == 5 else (0, 1, 2)}
 
 
 def heard_of(*fast, slow=None):
@@ -209,7 +218,7 @@ def test_a_run_that_heeds_returns_resumes_to_the_bit(tmp_path):
     """What was heard is in its checkpoints."""
     given = {"chunk_steps": 100, "curriculum": "progress:2:100", "eval_every": 1200, "num_tasks": 5}
     whole, again = whole_and_resumed("bandit", tmp_path, 2400, 1200, **given)
-    for name in ("agent", "heard", "rows"):
+    for name in ("agent", "heard", "rows", "begun"):
         require_same(getattr(whole.state, name), getattr(again.state, name))
     assert np.isfinite(whole.state.heard).all()
 
@@ -246,6 +255,31 @@ def test_a_replay_begins_anew_with_random_steps_where_tasks_change_unless_it_is_
     updates = lambda state: int(np.max(state.agent.fits["critic"].optimizer[1][0].count))
     assert [updates(state) for state in states] == [0, 5, 10]
     assert [updates(state) for state in kept] == [0, 5, 13]
+
+
+@pytest.mark.slow
+def test_the_same_tasks_go_on_without_a_new_beginning():
+    """A choice that names the same tasks keeps worlds and replay, and no action is random a second time."""
+    tasks = jax.tree.map(lambda x: jnp.stack([x[0], x[1], x[0]]), Walk().tasks())._replace(id=jnp.arange(3))
+    states, _ = played(tiny("sac-conditioned"), "growing:3:8:1000000", 3, tasks, **{**REPLAY, "warmup_steps": 3})
+    assert [int(state.data.ring.size) for state in states] == [0, 8, 16, 24]
+    assert [int(np.max(state.agent.fits["critic"].optimizer[1][0].count)) for state in states] == [0, 5, 13, 21]
+    assert all(int(state.begun) == 0 for state in states)
+
+
+@pytest.mark.slow
+def test_random_steps_follow_where_experience_begins_anew():
+    """Of a random task of three at a time: after the same one again none, after another one as many as at first."""
+    tasks = jax.tree.map(lambda x: jnp.stack([x[0], x[1], x[0]]), Walk().tasks())._replace(id=jnp.arange(3))
+    states, _ = played(tiny("sac"), "random:1:8", 6, tasks, **{**REPLAY, "warmup_steps": 3})
+    rows = [int(state.rows[0]) for state in states[1:]]
+    fresh = [True, *(one != other for one, other in itertools.pairwise(rows))]
+    assert True in fresh[1:] and False in fresh
+    begun = np.maximum.accumulate(8 * np.arange(6) * fresh)
+    assert [int(state.begun) for state in states[1:]] == begun.tolist()
+    assert [int(state.data.ring.size) for state in states[1:]] == (8 * np.arange(1, 7) - begun).tolist()
+    count = [int(np.max(state.agent.fits["critic"].optimizer[1][0].count)) for state in states]
+    assert np.diff(count).tolist() == [5 if one else 8 for one in fresh]
 
 
 @pytest.mark.slow

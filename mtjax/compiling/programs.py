@@ -45,7 +45,7 @@ def _specs(agent: Agent) -> TrainState:
     """Return how devices share each field of a training state."""
     by_world = TrainState(*[BY_WORLD] * len(TrainState._fields))  # type: ignore
     data = agent.experience.storage.sharding
-    alone = {"iteration": REPLICATED, "rows": REPLICATED, "heard": REPLICATED}
+    alone = dict.fromkeys(("iteration", "rows", "heard", "begun"), REPLICATED)
     return by_world._replace(agent=BY_SEED, data=data, key=BY_SEED, origins=BY_SEED, **alone)  # type: ignore
 
 

@@ -92,7 +92,10 @@ class Graph(Everything):
 
 @dataclasses.dataclass(frozen=True)
 class Random:
-    """Some tasks are played, and others drawn after so many steps of every environment, without repeating one."""
+    """Some tasks are played, and others drawn after so many steps of every environment, without repeating one.
+
+    Every choice of several tasks names them in the order of the table: one that stays the same changes nothing.
+    """
 
     played: int
     steps: int
@@ -108,7 +111,7 @@ class Random:
 
     def rows(self, step: Array, known: int) -> Array:
         key = _key(step // self.steps)
-        return jax.random.permutation(key, known)[: self.played].astype(jnp.int32)
+        return jnp.sort(jax.random.permutation(key, known)[: self.played].astype(jnp.int32))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +187,7 @@ def _most_urgent(urgency: Callable[[Array], Array]) -> Callable[..., Array]:
         known, order = len(heard), jax.random.uniform(order_key, heard.shape[:1])
         anyway = jax.random.uniform(random_key, heard.shape[:1]) < _RANDOM * self.played / known
         urgent = jnp.where(anyway | jnp.isnan(heard[:, 0]), jnp.inf, urgency(heard))
-        return jnp.lexsort((order, -urgent))[: self.played].astype(jnp.int32)
+        return _first(self.played, (order, -urgent))
 
     return choose
 
@@ -227,7 +230,15 @@ class Growing(Heeding):
         high = jnp.minimum(high + (heard[high, 0] >= self.enough), known - 1)
         ends, inside = (places == low) | (places == high), (low <= places) & (places <= high)
         order = jax.random.uniform(_key(step // self.steps), (known,))
-        return jnp.lexsort((order, ~ends, ~inside))[: self.played].astype(jnp.int32)
+        return _first(self.played, (order, ~ends, ~inside))
+
+
+def _first(count: int, keys: tuple[Array, ...]) -> Array:
+    """Return the first tasks (count,) by keys (N,), of which the last one decides first, in the order of the table.
+
+    In another order the same tasks would be taken for others, for which worlds and experience begin anew.
+    """
+    return jnp.sort(jnp.lexsort(keys)[:count].astype(jnp.int32))
 
 
 _RANDOM = 0.1  # share of the choices

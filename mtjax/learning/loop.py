@@ -85,11 +85,6 @@ class Settings:
         """Return which tasks are played."""
         return curricula.read(self.curriculum)
 
-    def stored(self, iteration: Array) -> Array:
-        """Return how many steps () of every environment experience holds, which begins anew where tasks change."""
-        every = 0 if self.keep_replay else self.plays.steps
-        return iteration % every if every else iteration
-
     @property
     def trial(self) -> Trials:
         """Return what a trial is."""
@@ -109,6 +104,12 @@ class TrainState(NamedTuple):
     rows: Any = None  # (T,) int32 numbers of the tasks that worlds play; None: all that the agent knows
     origins: Array | None = None  # (S,) int32 of a population: the first member from which each descends
     heard: Any = None  # (N, 2) of a curriculum that heeds returns: what was heard of all tasks that are known
+    begun: Array | None = None  # () int32 of a curriculum: the iteration at which experience last began
+
+    @property
+    def stored(self) -> Array:
+        """Return how many steps () of every environment were taken since experience began."""
+        return self.iteration if self.begun is None else self.iteration - self.begun
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -142,6 +143,7 @@ def init(
         key=key,
         rows=rows,
         heard=settings.plays.heard(len(known.id)),
+        begun=None if rows is None else jnp.int32(0),
     )
 
 
@@ -206,11 +208,11 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         state, steps, seen = _collect(env, agent, settings, tasks, state, act_key, reset_key)
         observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
         learners, steps = over_seeds(partial(_assess, agent, tasks), 0, 0)(_of_played(state.agent, state.rows), steps)
-        data = experience.add(state.data, steps)
-        learners, losses, learned = _learn(env, agent, settings, tasks, learners, data, state.iteration, learn_key)
+        state = state._replace(data=experience.add(state.data, steps))
+        learners, losses, learned = _learn(env, agent, tasks, learners, state, learn_key)
         learners = over_seeds(observe, 0, 0)(learners, steps)
         learners = _with_played(state.agent, learners, state.rows)
-        data = data if experience.storage.kept else ()
+        data = state.data if experience.storage.kept else ()
         return state._replace(agent=learners, data=data, key=key), seen | {"losses": losses, "learned": learned}
 
     state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
@@ -244,12 +246,12 @@ def _take_turns(env: Env, agent: Agent, settings: Settings, known: Task, state: 
         key, reset_key, data_key, act_key = split_keys(state.key, 4)
         worlds = _first_worlds(env, agent, settings, state.agent, tasks, world_keys(reset_key, shape))
         blank = _blank(env, agent, state.agent, tasks, worlds, world_keys(act_key, shape))
-        data = state.data
+        fresh = {"total": jnp.zeros(shape), "counted": worlds.age == 0}
         if not settings.keep_replay:
             data = agent.experience.init(blank, env.spec, shape[1], settings.num_envs, data_key)
-        fresh = {"total": jnp.zeros(shape), "counted": worlds.age == 0}
+            fresh |= {"data": data, "begun": state.iteration}
         fresh |= {"agent": _consolidate(env, agent, settings, known, state)}
-        return state._replace(worlds=worlds, data=data, key=key, rows=rows, **fresh)
+        return state._replace(worlds=worlds, key=key, rows=rows, **fresh)
 
     return jax.lax.cond(jnp.any(rows != state.rows), begin, lambda state: state, state)
 
@@ -379,8 +381,8 @@ def _played(state: TrainState, taken: tuple[Transition, Any]) -> tuple[TrainStat
 
 def _step(env, agent, settings: Settings, tasks, state: TrainState, keys: Key, reset_keys: Key):
     """Step every environment once, and begin new episodes where episodes ended."""
-    trials, shape, stored = settings.trial, state.total.shape, settings.stored(state.iteration)
-    explore = lambda action: agent.experience.explore(state.data, action, stored)
+    trials, shape = settings.trial, state.total.shape
+    explore = lambda action: agent.experience.explore(state.data, action, state.stored)
     act_keys = world_keys(keys, shape)
     worlds, env_step = step_envs(env, agent, state.agent, tasks, state.worlds, act_keys, explore, trials)
     transition, total = env_step.transition, state.total + env_step.transition.reward
@@ -397,19 +399,21 @@ def _step(env, agent, settings: Settings, tasks, state: TrainState, keys: Key, r
     return state, (followed(transition, env_step.ends, begun), seen)
 
 
-def _learn(
-    env, agent, settings: Settings, tasks, learners: Any, data: Any, iteration: Array, keys: Key
-) -> tuple[Any, Metrics, Array]:
+def _learn(env, agent, tasks, learners: Any, state: TrainState, keys: Key) -> tuple[Any, Metrics, Array]:
     """Update the agents of all seeds once the first random steps are over, which is at the same step for all seeds.
+
+    Args:
+        learners: the agents, which have assessed the latest steps.
+        state: the training state with these steps.
 
     Returns:
         their new states, the means of the updates' metrics, and () 1 if there were updates, else 0.
     """
-    experience = agent.experience
+    experience, data, iteration = agent.experience, state.data, state.iteration
     if not experience.warmup_steps:
         learners, metrics = _update(env, agent, tasks, learners, data, iteration, keys)
         return learners, metrics, jnp.float32(1)
-    learning, metrics = settings.stored(iteration - 1) >= experience.warmup_steps, {}
+    learning, metrics = state.stored - 1 >= experience.warmup_steps, {}
     learners = _reset_networks(env, agent, tasks, learners, iteration, keys)
     if experience.updates:
         update = lambda learners: _update(env, agent, tasks, learners, data, iteration, keys)

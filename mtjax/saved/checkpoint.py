@@ -29,7 +29,7 @@ from mtjax.types import InputError
 
 _KEPT = 2
 _RECORD = "config.json"  # beside the folder of checkpoints
-_FORMAT = 3  # counts the changes of the training state's structure
+_FORMAT = 4  # counts the changes of the training state's structure
 _FORMAT_FILE = "format.txt"  # checkpoints without one are of format 1
 _SUMS = "checksums.txt"  # as of sha256sum, by which users can check them too
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
@@ -141,7 +141,7 @@ def _finish(written: arrays.Written, record: bytes | None, new: Path, folder: Pa
 def _parts(state: TrainState) -> dict[str, Any]:
     """Return a state as it is written: the agents, and all else by name, without what only some runs have."""
     loop = state._replace(agent=None)._asdict()
-    own = {name: x for name, x in loop.items() if name not in ("origins", "heard") or x is not None}
+    own = {name: x for name, x in loop.items() if name not in ("origins", "heard", "begun") or x is not None}
     return {"agent": state.agent, "loop": own}
 
 
