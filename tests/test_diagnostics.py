@@ -346,7 +346,7 @@ def test_gradients_of_ppo_are_those_of_the_policy_gradient():
 
             slopes = {"actor": jax.grad(of_actor)(nets["actor"]), "critic": jax.grad(of_critic)(nets["critic"])}
             by_hand.append({name: jax.flatten_util.ravel_pytree(x.shared)[0] for name, x in slopes.items()})
-        value, units = flat.extras.value, state.nets["units"].own
+        value, units = flat.extras.value, state.nets["units"].own.moments
         target = units.mean[:, None] + jnp.sqrt(units.variance)[:, None] * flat.extras.target
         return found, by_hand, jnp.mean(jnp.abs(target - value), axis=1)
 

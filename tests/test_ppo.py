@@ -40,6 +40,7 @@ from mtjax.agents.parts.samplers import SAMPLERS
 from mtjax.agents.parts.scaling import SCALINGS
 from mtjax.agents.parts.scaling.base import Moments
 from mtjax.agents.ppo import PPO, within
+from mtjax.agents.state import of_tasks, with_tasks
 from mtjax.agents.view import init_inputs
 from mtjax.config import with_preset
 from mtjax.envs.probes import Probe, tasks_of
@@ -341,7 +342,7 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     state, _ = critics.renew(agent, state, targets[1])
     units = Units.of(state)
     if kind == "none":
-        assert units.count == 0 and np.all(units.std == 1)
+        assert np.all(units.count == 0) and np.all(units.std == 1)
         return
     both = np.concatenate(targets, axis=1)
     np.testing.assert_allclose(units.moments.mean, both.mean(axis=1), rtol=1e-4)
@@ -352,6 +353,24 @@ def test_units_are_moments_of_all_targets_at_first(kind):
     many = with_nets(state, units=units._replace(count=jnp.float32(500)).params())
     moved = critics.renew(agent, many, targets[0])[1].moments
     np.testing.assert_allclose(moved.mean, 0.9 * units.moments.mean + 0.1 * targets[0].mean(axis=1), rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["running", "popart"])
+def test_a_task_that_is_played_later_takes_its_first_targets_for_its_units(kind):
+    """Whatever was counted of others: its moments are those of its targets, and outputs as they were."""
+    agent = small(value_normalization=kind, value_rate=0.1)
+    state, obs = agent.init(SPEC, TASKS, KEY), jnp.float32(np.random.default_rng(0).normal(size=(3, 5, 3)))
+    targets = jnp.float32(1e-3 * (5 + np.random.default_rng(0).normal(size=(3, 50))))
+    outputs = lambda state: critics.outputs(agent, state, TASKS.context, obs)
+    before, rows = outputs(state)[1], jnp.array([1])
+    for played in (jnp.array([0, 2]), jnp.array([0, 2]), rows):
+        part, _ = critics.renew(agent, of_tasks(state, played), targets[played])
+        state = with_tasks(state, part, played)
+    units = state.nets["units"].own
+    np.testing.assert_array_equal(units.count, [2, 1, 2])
+    np.testing.assert_allclose(units.moments.mean, targets.mean(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(units.std, targets.std(axis=1), rtol=1e-4)
+    np.testing.assert_array_equal(outputs(state)[1], before)
 
 
 @pytest.mark.parametrize("kind", ["none", "running", "popart"])

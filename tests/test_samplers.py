@@ -196,3 +196,11 @@ def test_a_curriculum_begins_with_the_shortest_sketches_there_are():
     np.testing.assert_allclose(sampler.weights(longer, ALIKE), [1.5, 0, 1.5])
     after = sampler.observe(longer, all_end([1, 0, 1]))
     np.testing.assert_array_equal(after.longest, [4, 4, 4])
+
+
+def test_a_task_that_was_not_played_joins_at_the_length_that_others_reached():
+    """A curriculum of the loop played one and two symbols up to two; the third task remembers none."""
+    sampler, memory = short_and_long([])
+    joined = memory._replace(longest=jnp.int32([2, 2, 0]))
+    np.testing.assert_allclose(sampler.weights(joined, ALIKE), [1, 1, 1])
+    np.testing.assert_array_equal(sampler.observe(joined, all_end([1, 0, 0])).longest, [2, 2, 2])

@@ -23,22 +23,28 @@ MIN_STD = 1e-4
 class Units(NamedTuple):
     """Holds the units of the critic's outputs, by task: a value is mean + std times an output."""
 
-    count: Array  # () how often they have moved
+    count: Array  # (T,) how often they have moved; () where that is the same for all
     moments: Moments  # of targets, (T,)
 
     @staticmethod
     def begin(num_tasks: int) -> "Units":
         """Return units in which outputs are values."""
-        return Units(jnp.float32(0), Moments.begin(num_tasks))
+        return Units(jnp.zeros(num_tasks), Moments.begin(num_tasks))
 
     @staticmethod
     def of(state: AgentState) -> "Units":
-        """Return the units that a state holds."""
-        return Units(state.nets["units"].shared["count"], state.nets["units"].own)
+        """Return the units that a state holds.
+
+        Where a curriculum plays some of the tasks, each has a count of its own, so that it begins with its first
+        targets. All tasks have one: with a rate for each XLA would round otherwise.
+        """
+        units: Units = state.nets["units"].own
+        some = len(units.count) < state.num_tasks
+        return units if some else units._replace(count=jnp.min(units.count))
 
     def params(self) -> Params:
         """Return the units as a network of the agent's."""
-        return Params({"count": self.count}, self.moments)
+        return Params({}, self._replace(count=jnp.broadcast_to(self.count, self.moments.mean.shape)))
 
     @property
     def std(self) -> Array:
@@ -61,7 +67,7 @@ class Units(NamedTuple):
         """Return units that have moved towards targets (T, N) of this and other devices.
 
         Args:
-            rate: weight of these targets; the first ones have equal weights.
+            rate: weight of these targets; the first ones of a task have equal weights.
         """
         rate = jnp.maximum(rate, 1 / (self.count + 1))
         mean, variance = (x[:, 0] for x in mean_and_variance(target, 1))
@@ -70,7 +76,7 @@ class Units(NamedTuple):
     def change(self, new: "Units") -> tuple[Array, Array]:
         """Return by which factor and offset (T,) outputs change in new units, if values do not.
 
-        The first units change nothing: before them, outputs stand for no values.
+        A task's first units change nothing: before them, its outputs stand for no values.
         """
         known = self.count > 0
         offset = (self.moments.mean - new.moments.mean) / new.std

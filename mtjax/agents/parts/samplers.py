@@ -183,7 +183,7 @@ class ByLength(Uniform):
         returns = _follow(memory.returns, steps, self.return_rate, self.return_rate)
         longest = _present(memory)
         behind = (memory.length <= longest) & ~(returns.known & (returns.slow > self.mastered))
-        return Curriculum(returns, memory.length, longest + ~jnp.any(behind))
+        return Curriculum(returns, memory.length, jnp.full_like(memory.longest, longest + ~jnp.any(behind)))
 
     def weights(self, memory: Curriculum, temperature: Array) -> Array:
         missing = 1 - jnp.where(memory.returns.known, jnp.clip(memory.returns.slow, 0.0, 1.0), 0.0) + 0.01
@@ -192,8 +192,11 @@ class ByLength(Uniform):
 
 
 def _present(memory: Curriculum) -> Array:
-    """Return the length (T,) up to which sketches take part: some task always does."""
-    return jnp.clip(memory.longest, jnp.min(memory.length), jnp.max(memory.length))
+    """Return the length () up to which sketches take part: some task always does.
+
+    A task that a curriculum did not play for a while remembers an earlier one, so that the longest counts.
+    """
+    return jnp.clip(jnp.max(memory.longest), jnp.min(memory.length), jnp.max(memory.length))
 
 
 @dataclasses.dataclass(frozen=True)
