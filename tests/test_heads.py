@@ -9,6 +9,7 @@ from test_ppo import BEST, LEARN, SCALES
 
 import mtjax
 from mtjax.agents import combinations
+from mtjax.command import run_config
 from mtjax.envs.probes import Probe
 from mtjax.types import InputError
 
@@ -91,3 +92,9 @@ def test_what_shares_nothing_is_told():
     for name, settings, said in refused:
         with pytest.raises(InputError, match=said):
             mtjax.agent(name, **settings)
+
+
+def test_a_command_chooses_parts_by_the_heads_of_one_network():
+    """PopArt rescales heads of each task's own, which critics alone may have."""
+    words = ["--env=point-mass-vary-goal", "--agent=sac", "--agent.scaling=popart", "--agent.critic-heads=per-task"]
+    assert run_config.draft(words).learner.scaling.rescales

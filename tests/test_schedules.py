@@ -14,6 +14,7 @@ from probes import Walk, quick, random_batch, tasks_of, tiny, train, train_objec
 import mtjax.train
 from mtjax.agents.parts.gradients.descent import schedule
 from mtjax.agents.swept import with_numbers
+from mtjax.command import run_config
 from mtjax.experience import Replay
 from mtjax.types import InputError, Spec
 
@@ -141,12 +142,28 @@ def test_rates_of_what_learns_at_every_fourth_update_fall_with_the_updates():
             {"lr_schedule": "linear", "experience": Replay(reset_every=9)},
             "reset-every begins the optimisers anew, and lr-schedule=linear with them; use constant",
         ),
+        (
+            {"lr_schedule": "cosine", "reset_optimizer": True},
+            "reset-optimizer begins the optimisers anew, and lr-schedule=cosine with them; use constant",
+        ),
+        (
+            {"lr_schedule": "linear", "continual": "scratch"},
+            "continual=scratch begins the optimisers anew, and lr-schedule=linear with them; use constant",
+        ),
     ],
 )
 def test_what_cannot_be_right_is_refused(settings, message):
     """Before anything compiles."""
     with pytest.raises(InputError, match=message):
         tiny("sac", **settings)
+
+
+def test_a_command_replaces_the_schedule_of_a_preset_before_its_parts_are_chosen():
+    """A race's preset has rates that fall, which tasks that are learned from scratch refuse."""
+    words = ["--env=racing", "--agent=ppo", "--agent.continual=scratch", "--curriculum=sequence:1000"]
+    with pytest.raises(InputError, match="continual=scratch begins the optimisers anew, and lr-schedule=linear"):
+        run_config.draft(words)
+    assert run_config.draft([*words, "--agent.lr-schedule=constant"]).learner.continual.restarts
 
 
 def test_a_warmup_is_shorter_than_the_run():

@@ -125,8 +125,14 @@ def _check_schedule(agent: Any) -> None:
     if shape == "constant" and (agent.lr_final or agent.lr_updates):
         given = f"lr-final={agent.lr_final}" if agent.lr_final else f"lr-updates={agent.lr_updates}"
         raise InputError(f"{given} is where a schedule ends, and lr-schedule=constant is none; use linear or cosine")
-    if shape != "constant" and agent.experience.reset_every:
-        raise InputError(f"reset-every begins the optimisers anew, and lr-schedule={shape} with them; use constant")
+    restarts = {
+        "reset-every": agent.experience.reset_every,
+        "reset-optimizer": agent.continual.reset_optimizer,
+        f"continual={_name(agent, 'continual')}": agent.continual.restarts,
+    }
+    cause = next((name for name, present in restarts.items() if present), "")
+    if shape != "constant" and cause:
+        raise InputError(f"{cause} begins the optimisers anew, and lr-schedule={shape} with them; use constant")
 
 
 def _check_units(agent: Any) -> None:

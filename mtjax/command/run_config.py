@@ -22,7 +22,7 @@ from mtjax.saved.config_json import from_json
 
 _NO_FLAGS = ("vary", "context-ranges", "points", "teacher", "imports")  # vary has one for each parameter, taken out
 _FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
-_DECIDING = ("vectors", "heads", "actor_heads", "critic_heads")  # they decide which parts are allowed
+_DECIDING = ("vectors", "heads", "actor-heads", "critic-heads", "lr-schedule")  # they decide which parts are allowed
 
 
 def parse(argv: Sequence[str]) -> RunConfig:
@@ -61,7 +61,8 @@ def draft(argv: Sequence[str]) -> RunConfig:
             of_family[name] = int(value)
     if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
-    deciding: dict[str, Any] = {name: value for name in _DECIDING if (value := flag_value(argv, f"agent.{name}", ""))}
+    given = {name.replace("-", "_"): flag_value(argv, f"agent.{name}", "") for name in _DECIDING}
+    deciding: dict[str, Any] = {name: value for name, value in given.items() if value}
     if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse
         deciding["normalize_observations"] = False
     begun = beginning(preset_of(agent_name).cls, sources[0].learner, sources[0].family) if sources else None
