@@ -209,6 +209,8 @@ def test_a_run_resumes_to_the_bit(tmp_path, name, given):
         ("distral", {"continual": "ewc"}, "heads=disjoint shares nothing"),
         ("xqc", {"continual": "ewc"}, "holds one actor"),
         ("ppo", {"continual": "packnet", "normalize_observations": False}, "PPO has rollouts"),
+        ("ppo", {"continual": "packnet", "normalize_observations": False, "retrain_updates": 0}, "PPO has rollouts"),
+        ("ppo", {"continual": "ewc", "conditioning": "recurrent"}, "PPO has rollouts; use another conditioning"),
         ("sac", {"continual": "ewc", "fisher_samples": 31}, "fisher-samples must be at least 32"),
         ("sac", {"continual": "packnet", "retrain_updates": -1}, "retrain-updates must be at least 0"),
         ("sac", {"continual": "ewcc"}, "did you mean 'ewc'"),

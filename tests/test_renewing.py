@@ -108,7 +108,8 @@ def test_shrinking_and_perturbing_changes_what_tasks_share_alone():
     [
         ("sac", {"heads": "per-task"}, "heads=shared"),
         ("brc", {}, "encoder=identity"),
-        ("sac-conditioned", {"continual": "packnet"}, "continual=packnet keeps"),
+        ("sac-conditioned", {"continual": "packnet"}, "redo changes the weights that continual=packnet keeps"),
+        ("sac-conditioned", {"continual": "packnet", "plasticity": "shrink-and-perturb"}, "continual=packnet keeps"),
         ("sac", {"redo_every": 0}, "redo-every must be at least 1"),
     ],
 )

@@ -144,8 +144,6 @@ def _check_units(agent: Any) -> None:
             f"plasticity={_name(agent, 'plasticity')} renews the units of plain MLPs that all tasks share: it needs "
             "encoder=identity, representation=plain, heads=shared, unit-head=false and tune=all, in sac or ppo"
         )
-    if agent.continual.freezes:
-        raise InputError(f"plasticity changes the weights that continual={_name(agent, 'continual')} keeps; use one")
 
 
 def check_replayed(agent: Any) -> None:
@@ -183,17 +181,22 @@ def _check_continual(agent: Any) -> None:
     name = _name(agent, "continual")
     if heads(agent, "actor") == "disjoint":
         raise InputError(f"continual={name} holds what tasks share, and heads=disjoint shares nothing; use per-task")
-    if not agent.experience.storage.kept and (agent.continual.retrains or agent.conditioning.recurs):
+    rollouts = "" if agent.experience.storage.kept else f"{type(agent).__name__} has rollouts"
+    if rollouts and agent.continual.freezes:
         raise InputError(
-            f"continual={name} learns on from a replay, or holds a policy with a memory, and {type(agent).__name__} "
-            "has rollouts; use retrain-updates=0 and another conditioning, or sac"
+            f"continual={name} learns on from a replay, and {rollouts}; use sac, or another way to remember"
         )
+    if rollouts and agent.conditioning.recurs:
+        raise InputError(f"continual={name} holds no policy with a memory where {rollouts}; use another conditioning")
     if agent.fits_statistics or agent.distils:
         raise InputError(
             f"continual={name} holds one actor without statistics, as sac has; not {type(agent).__name__}'s"
         )
     if not agent.continual.freezes:
         return
+    if agent.plasticity.every or agent.plasticity.changes:
+        changes = f"plasticity={_name(agent, 'plasticity')}"
+        raise InputError(f"{changes} changes the weights that continual={name} keeps as they are; use one of them")
     knows, sees = agent.conditioning, agent.representation
     changing = {
         "normalize-observations": (agent.normalize_observations, "normalize-observations=false"),
