@@ -106,7 +106,10 @@ def test_shrinking_and_perturbing_changes_what_tasks_share_alone():
 @pytest.mark.parametrize(
     "agent, given, said",
     [
-        ("sac", {"heads": "per-task"}, "heads=shared"),
+        ("sac", {"heads": "per-task"}, "heads is shared, not per-task"),
+        ("sac", {"actor_heads": "per-task"}, "actor-heads is shared, not per-task"),
+        ("ppo", {"plasticity": "continual-backprop", "critic_heads": "per-task"}, "critic-heads is shared"),
+        ("ppo", {"value_normalization": "popart"}, "value-normalization=popart gives each a head of its critic"),
         ("brc", {}, "encoder=identity"),
         ("sac-conditioned", {"continual": "packnet"}, "redo changes the weights that continual=packnet keeps"),
         ("sac-conditioned", {"continual": "packnet", "plasticity": "shrink-and-perturb"}, "continual=packnet keeps"),

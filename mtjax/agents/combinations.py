@@ -137,13 +137,17 @@ def _check_schedule(agent: Any) -> None:
 
 def _check_units(agent: Any) -> None:
     """Refuse to renew units of networks that are no plain MLPs of all tasks."""
+    renews = f"plasticity={_name(agent, 'plasticity')} renews the units of plain MLPs that all tasks share"
     plain = type(agent.encoder.body(agent.hidden, layer_norm=False)) is Trunk and not agent.encoder.front()
     otherwise = agent.representation.learns or agent.fits_statistics or agent.distils
-    if not plain or otherwise or agent.unit_head or agent.heads != "shared" or agent.tune != "all":
+    if not plain or otherwise or agent.unit_head or agent.tune != "all":
         raise InputError(
-            f"plasticity={_name(agent, 'plasticity')} renews the units of plain MLPs that all tasks share: it needs "
-            "encoder=identity, representation=plain, heads=shared, unit-head=false and tune=all, in sac or ppo"
+            f"{renews}: it needs encoder=identity, representation=plain, unit-head=false and tune=all, in sac or ppo"
         )
+    # Heads of tasks that a curriculum does not play would keep their weights out of a unit that begins anew.
+    require_heads(agent, "shared", renews)
+    if agent.critic.own:
+        raise InputError(f"{renews}, and value-normalization=popart gives each a head of its critic; use running")
 
 
 def check_replayed(agent: Any) -> None:
