@@ -98,7 +98,7 @@ class CartpoleBalance(Domain):
 
 @dataclasses.dataclass(frozen=True)
 class CartpoleSwingup(CartpoleBalance):
-    """Swing-up: as ``CartpoleBalance``, but the pole starts hanging.
+    """Swing up the pole, which starts hanging, and balance it. All else is as in ``CartpoleBalance``.
 
     Start: cart normal about the middle and pole normal about straight down, with deviations of 0.01 m and 0.01 rad;
         both velocities normal with deviation 0.01.

@@ -243,7 +243,7 @@ class DogTrot(Dog):
 
 @dataclasses.dataclass(frozen=True)
 class DogRun(Dog):
-    """Run: DogWalk at 9 to 18 m/s."""
+    """Run: as the walk, but at 9 to 18 m/s."""
 
     parameters: ClassVar = MappingProxyType({**Dog.parameters, "speed": positive("m/s", 9.0)})
     floor: ClassVar[float] = 9 * _SECONDS

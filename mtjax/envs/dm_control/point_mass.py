@@ -96,7 +96,7 @@ class PointMass(Domain):
 
 @dataclasses.dataclass(frozen=True)
 class PointMassNavigate(PointMass):
-    """Navigate: as ``PointMass``, but every episode starts in the middle, and the reward shows the way.
+    """Navigate from the middle to a goal, by a reward that shows the way. All else is as in ``PointMass``.
 
     The two-dimensional navigation of Finn et al. 2017 ("Model-agnostic meta-learning"), whose reward is the negative
     squared distance from the goal; dm_control's own vanishes a few radii away, so that a goal must be found by chance.

@@ -116,7 +116,7 @@ class Reacher(Domain):
 
 @dataclasses.dataclass(frozen=True)
 class ReacherTarget(Reacher):
-    """Reach the task's target: as ``Reacher``, but a task's target stays where it is and is not seen.
+    """Reach the task's target, which stays where it is and is not seen. All else is as in ``Reacher``.
 
     Observation (6,): as ``Reacher``'s, but with the position of the finger, x and y from the shoulder [m], in place of
         the way to the target, which would give the task away.
