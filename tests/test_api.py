@@ -352,7 +352,7 @@ def test_a_class_without_a_name_has_no_folder(tmp_path):
 def test_agents_are_called_by_their_names(name):
     """Also with other settings of their own."""
     assert agents.name_of(mtjax.agent(name)) == name
-    assert agents.name_of(mtjax.agent(name, gamma=0.5)) == name
+    assert agents.name_of(mtjax.agent(name, hidden=(8,))) == name
 
 
 def test_what_is_printed_is_a_line(result):

@@ -250,7 +250,7 @@ def test_the_loop_learns_from_relabelled_batches(drawn):
     ("name", "settings", "reason"),
     [
         ("cheetah-run-vary-torso-length", {}, "torso-length changes what happens; vary nothing but speed"),
-        ("point-mass-vary-goal", {"vary": {"mass": "0.5,2"}}, "mass changes what happens"),
+        ("point-mass-vary-goal", {"vary": {"mass": "0.5:2"}}, "mass changes what happens"),
         ("cheetah-run", {}, "its tasks have the same goal; vary speed"),
         ("walker-stand", {}, "its rewards do not follow"),
         ("two-goal-maze", {}, "its rewards do not follow"),

@@ -102,7 +102,8 @@ def test_the_actors_gradient_is_behind_a_branch_for_any_number_of_seeds(seeds):
             item = jax.tree.map(lambda x: x[0, 0], random_batch(0, 2, 4, SPEC))
             states = jax.vmap(lambda key: agent.init(SPEC, TASKS, key))(keys)
             data = replay.init(item, SPEC, 2, 4, keys)
-            return loop._learn(Walk(), agent, loop.Settings(num_envs=4), TASKS, states, data, iteration, keys)
+            state = loop.TrainState(*[None] * len(loop.TrainState._fields))._replace(data=data, iteration=iteration)
+            return loop._learn(Walk(), agent, TASKS, states, state, keys)
 
         found[delay] = branches(jax.make_jaxpr(learn)(jax.random.split(KEY, seeds), jnp.int32(5)).jaxpr)
     assert found == {1: 1, 2: 2}  # whether to learn at all, and the actor's turn
