@@ -63,6 +63,7 @@ class Chance:
     plasticity: ClassVar[Plasticity] = Plasticity()
     goes_on: ClassVar[bool] = False
     taught: ClassVar[bool] = False
+    in_training: ClassVar = {}
 
     def init(self, spec: Any, tasks: Any, key: Any) -> Any:
         return jnp.zeros(1)

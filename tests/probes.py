@@ -177,6 +177,7 @@ class Stub:
     plasticity: ClassVar[Plasticity] = Plasticity()
     goes_on: ClassVar[bool] = False
     taught: ClassVar[bool] = False
+    in_training: ClassVar = {}
 
     def init(self, spec, tasks, key):
         return jnp.zeros(1)
