@@ -234,7 +234,7 @@ class Growing(Heeding):
 
 
 def _first(count: int, keys: tuple[Array, ...]) -> Array:
-    """Return the first tasks (count,) by keys (N,), of which the last one decides first, in the order of the table.
+    """Sort tasks by keys (N,), the last key first as in ``lexsort``, and return the first ones (count,) by number.
 
     In another order the same tasks would be taken for others, for which worlds and experience begin anew.
     """
