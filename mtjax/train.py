@@ -10,7 +10,7 @@ from mtjax.names import become, command, load
 def main(argv: Sequence[str]) -> None:
     """Check names and flags first, then import the training code and run the command line."""
     flags = flag_files.expand(argv)
-    with flag_files.naming(argv):
+    with flag_files.naming(argv), refusals.settings_as_flags():
         _run(flags)
 
 

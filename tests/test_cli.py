@@ -103,6 +103,12 @@ def test_flags_may_be_written_in_three_ways(words):
     assert program.learner.shared_temperature
 
 
+def test_flags_that_decide_may_be_written_with_underscores():
+    """A memory's minibatches are fitted to the worlds that are given."""
+    words = ["--env=point-mass-vary-goal", "--env.num-tasks=50", "--split=none", "--agent=rl2", "--preset=gpu"]
+    assert parse([*words, "--num_envs=41"]) == parse([*words, "--num-envs=41"])
+
+
 @pytest.mark.parametrize(
     ("words", "plain"),
     [

@@ -13,6 +13,7 @@ from test_ppo import random_steps
 import mtjax
 from mtjax import agents
 from mtjax.agents import for_action
+from mtjax.agents.networks import Params
 from mtjax.agents.swept import sweepable
 from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.command import run_config
@@ -63,6 +64,17 @@ def test_targets_are_those_of_a_plain_loop(cut):
                 ahead = then[t, world].max() if last else 0.4 * then[t, world].max() + 0.6 * later
                 later = one.reward[t, world] + 0.9 * one.discount[t, world] * ahead
                 assert float(found[task, t, world]) == pytest.approx(float(later), abs=1e-4)
+
+
+def test_targets_are_in_the_units_of_each_task():
+    """Rewards are divided by their deviation, if asked."""
+    plain, scaled = small(), small(scaling="reward")
+    state, steps, std = scaled.init(SPEC, TASKS, KEY), steps_of(scaled), jnp.float32([2.0, 0.5, 4.0])
+    memory = state.nets["scaling"].own._replace(variance=jnp.square(std))
+    found = scaled.assess(state.with_nets(scaling=Params({}, memory)), steps, TASKS)[1].extras
+    divided = steps._replace(reward=steps.reward / std[:, None, None])
+    expected = plain.assess(plain.init(SPEC, TASKS, KEY), divided, TASKS)[1].extras
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_the_loss_is_of_the_actions_that_were_taken():
@@ -146,7 +158,7 @@ def test_greedy_actions_are_those_of_value_iteration():
         ({"epsilon": -0.1}, "epsilon"),
         ({"epsilon_rollouts": 0}, "epsilon-rollouts must be at least 1"),
         ({"representation": "deepmdp"}, "use representation=plain"),
-        ({"scaling": "return"}, "scaling=none"),
+        ({"scaling": "popart", "heads": "per-task"}, "no scaling=popart"),
         ({"sampler": "hardest"}, "sampler=uniform"),
     ],
 )

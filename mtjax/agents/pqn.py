@@ -16,7 +16,6 @@ from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.policies.categorical import allowed
 from mtjax.agents.parts.samplers import Uniform
-from mtjax.agents.parts.scaling import NoScaling
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Rollouts
@@ -40,7 +39,8 @@ class PQN(BaseAgent):
     After H steps of every environment, backwards from the last one:
         G_t = r_t + gamma d_t ((1 - lambda) max_a Q(s'_t, a) + lambda G_(t+1))                (target)
         L_Q = (Q(s, a) - G)^2 / 2                                                             (loss)
-    averaged over a task's minibatch, then over tasks. A time limit ends the sum too.
+    averaged over a task's minibatch, then over tasks. A time limit ends the sum too. With a ``scaling`` r and Q are in
+    units of the task's own, so that tasks with large rewards do not outweigh others.
     Targets are the critic's from before the update. Layer normalisation keeps it stable, with neither a replay nor a
     slow copy of the critic. Actions are the best ones, or with the probability epsilon uniform ones, among those that
     the task has. Epsilon falls along a line from 1 to ``epsilon`` over the first ``epsilon_rollouts`` rollouts.
@@ -84,8 +84,8 @@ class PQN(BaseAgent):
         parts.require_counts(self, "epsilon_rollouts")
         if self.representation.learns:
             raise InputError("pqn learns values of observations as they are; use representation=plain")
-        if type(self.scaling) is not NoScaling or type(self.sampler) is not Uniform:
-            raise InputError("pqn takes rewards as they are, of all tasks alike: scaling=none and sampler=uniform")
+        if self.scaling.rescales or type(self.sampler) is not Uniform:
+            raise InputError("pqn keeps its heads, and learns all tasks alike: no scaling=popart, and sampler=uniform")
 
     # Networks.
 
@@ -130,13 +130,14 @@ class PQN(BaseAgent):
         flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
         values, following = (self.values(state, features, x, tasks) for x in (obs, next_obs))
         greedy = jnp.argmax(values, axis=-1) == flat.action
+        gamma = discounts_of_all(self, tasks)
+        reward = self.scaling.rewards(state.nets["scaling"].own, flat, gamma, jnp.zeros(len(gamma)))
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
-        cut, following = steps.cut, in_order(jnp.max(following, axis=-1))
+        cut, following, reward = steps.cut, in_order(jnp.max(following, axis=-1)), in_order(reward)
         if self.cut_exploration:
             cut |= jnp.roll(~in_order(greedy), -1, axis=1)
-        gamma = discounts_of_all(self, tasks)
         returns = jax.vmap(partial(targets.lambda_returns, lambda_=self.q_lambda))
-        return state, steps._replace(extras=returns(steps._replace(cut=cut), following, gamma))
+        return state, steps._replace(extras=returns(steps._replace(cut=cut, reward=reward), following, gamma))
 
     def values(self, state: AgentState, features: Array, obs: Any, tasks: Task) -> Array:
         """Return the values (T, B, A) of all actions; those that a task does not have are worth nothing at all."""

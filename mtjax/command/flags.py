@@ -56,19 +56,21 @@ def with_port(argv: Sequence[str]) -> list[str]:
 
 
 def plain_values(argv: Sequence[str]) -> list[str]:
-    """Return a command line in which --SWITCH=true, --SWITCH=false and whole numbers such as 1e6 are as tyro has them.
+    """Return a command line whose flags have hyphens, and values such as --SWITCH=true and 1e6 as tyro has them.
 
-    Switches of the user's own classes stay as they are.
+    Parameters that vary keep their names, and switches of the user's own classes their values.
     """
     switches, whole = all_flags(), {f"--{flag}" for flag in whole_flags()}
     words, before = [], ""
     for word in argv:
-        flag, _, value = word.partition("=")
-        name, truth = flag.replace("_", "-"), value.lower()
+        flag, equals, value = word.partition("=")
+        name, truth = flag if flag.startswith(VARY) else flag.replace("_", "-"), value.lower()
         if truth in ("true", "false") and switches.get(name):
             word = name if truth == "true" else switched_off(name)
         elif name in whole and value:
-            word = f"{flag}={_in_digits(value)}"
+            word = f"{name}={_in_digits(value)}"
+        elif flag.startswith("--"):
+            word = f"{name}{equals}{value}"
         elif before in whole:
             word = _in_digits(word)
         words.append(word)

@@ -1,9 +1,10 @@
 """Words of a command line that are refused before JAX is imported: unknown names, flags and runs, and wrong numbers."""
 
+import contextlib
 import dataclasses
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from mtjax.agents import AGENTS, preset_of
@@ -18,6 +19,7 @@ _MAY_CHANGE = {  # the only flags beside --resume
     *("--resume", "--steps", "--import", "--distributed", "--profile", "--view"),
     *("--tensorboard", "--trackio", "--wandb"),
 }
+_SETTING = re.compile(r"(?<![\w.-])([a-z][\w-]*)=(?=\w)")
 
 
 def check_names(argv: Sequence[str]) -> None:
@@ -89,6 +91,21 @@ def check_flags_of(cls: type, argv: Sequence[str]) -> None:
         flag = word.split("=", 1)[0].replace("_", "-")
         if flag.startswith("-") and flag not in allowed and not re.match(r"-\.?\d", flag):
             raise unknown_flag(flag, known)
+
+
+@contextlib.contextmanager
+def settings_as_flags() -> Iterator[None]:
+    """Write an agent's settings in errors as flags: ``scaling=none``, as Python has it, is ``--agent.scaling=none``."""
+    try:
+        yield
+    except InputError as error:
+        error.args = (_SETTING.sub(_as_flag_of_agent, str(error)),)
+        raise
+
+
+def _as_flag_of_agent(setting: re.Match) -> str:
+    flag = f"--agent.{as_flag(setting[1])}"
+    return f"{flag}=" if flag in all_flags() else setting[0]
 
 
 def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:

@@ -143,7 +143,7 @@ def _peel_shared(argv: Sequence[str], mixture: Mixture) -> tuple[dict[str, Any],
     for word in argv:
         if word.startswith("--"):
             flag, equals, value = word.partition("=")
-            name = known.get(flag.replace("_", "-"))
+            name = known.get(flag)
             if name is not None:
                 kind, default = fields[name]
                 given[name] = (name, kind, dataclasses.field(default=default))
@@ -193,7 +193,7 @@ def _check_flags(argv: Sequence[str], config: RunConfig) -> None:
     known = {**flags(config), "--help": False, "--import": False}
     allowed = {*known, *map(switched_off, known)}  # what is no switch is refused by name when it is parsed
     for word in argv:
-        flag = word.split("=", 1)[0].replace("_", "-")
+        flag = word.split("=", 1)[0]
         if flag.startswith("--") and flag not in allowed:
             require_pictures(config.env, flag.removeprefix("--env."))
             name = flag.removeprefix("--").removeprefix("agent.").replace("-", "_")
