@@ -297,6 +297,8 @@ class Env(Protocol):
     @property
     def ends_early(self) -> bool: ...  # whether episodes may end before their limit; it decides how resets are computed
     @property
+    def reset_batches(self) -> int: ...  # in how many batches all worlds are reset, where episodes end early
+    @property
     def finite_horizon(self) -> bool: ...  # whether the limit of time is part of the problem, so that its end is one
     def tasks(self, split: str = "train") -> Task: ...
     def task_values(self, split: str) -> Any: ...

@@ -83,7 +83,7 @@ def test_some_worlds_are_reset_to_the_states_that_all_would_have(share, shift):
     jax.tree.map(np.testing.assert_array_equal, some, whole)
     np.testing.assert_array_equal(np.asarray(some.age), np.where(ended, 0, 7))
     np.testing.assert_array_equal(some.state[~ended], before.state[~ended])
-    batch = -(-ended.size // rollout._SHARES)
+    batch = -(-ended.size // Fall.reset_batches)
     assert count == -(-ended.sum() // batch) * batch and all_of_them == ended.size * np.any(ended)
 
 

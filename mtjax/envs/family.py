@@ -64,6 +64,7 @@ class Family(abc.ABC):
     pixels: ClassVar[int] = 0  # on each side of the pictures that agents observe; 0 if they see none
     frames: ClassVar[int] = 1  # how many of the last pictures an agent sees at once, if it observes pictures
     ends_early: ClassVar[bool] = True  # whether episodes may end before their limit; it decides how resets are computed
+    reset_batches: ClassVar[int] = 16  # in how many all worlds are reset, if they end early; more where starts are dear
     films: ClassVar[bool] = False  # whether its worlds can be seen in films
     film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     filmed: ClassVar[Callable[[], AbstractContextManager[None]]] = nullcontext  # a context to play filmed episodes in

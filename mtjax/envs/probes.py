@@ -96,6 +96,7 @@ class Probe:
     """An environment that is any of the probes, by the task's ``kind``."""
 
     ends_early: ClassVar[bool] = True
+    reset_batches: ClassVar[int] = 16
     finite_horizon: ClassVar[bool] = False
     kind: str = "one-step"
     episode_length: int = LIMIT

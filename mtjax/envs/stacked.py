@@ -46,6 +46,11 @@ class Stacked:
         return self.family.ends_early
 
     @property
+    def reset_batches(self) -> int:
+        """Return in how many batches all worlds are reset."""
+        return self.family.reset_batches
+
+    @property
     def finite_horizon(self) -> bool:
         """Return whether how long an episode is, is part of the problem."""
         return self.family.finite_horizon

@@ -18,9 +18,6 @@ from mtjax.types import Acted, Agent, Array, Env, Key, Lasting, Task, Transition
 _LARGEST = 1e10
 """Largest number in an observation: MuJoCo's own bound of positions and velocities (``mjMAXVAL``)."""
 
-_SHARES = 16
-"""The batches in which all worlds are reset, if episodes end early."""
-
 
 class Worlds(NamedTuple):
     """Holds the state of every world; leaves (S, T, E, ...)."""
@@ -292,10 +289,10 @@ def _change_tasks(
 
 
 def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> tuple[_Begun, Array]:
-    """Reset worlds that have ended with keys (S, T, E), in batches of at most one in ``_SHARES`` of all worlds."""
+    """Reset worlds that have ended with keys (S, T, E), in batches, of which ``env.reset_batches`` hold all worlds."""
     ended = ends.episode
     _, num_tasks, num_envs = ended.shape
-    count, size = ended.size, -(-ended.size // _SHARES)
+    count, size = ended.size, -(-ended.size // env.reset_batches)
     flat_keys, closed = keys.reshape(count), ends.trial.reshape(count)
 
     def tasks_of(chosen: Array, old: Task | None, keys: Key) -> tuple[Task, Key]:

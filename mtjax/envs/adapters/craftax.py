@@ -44,6 +44,7 @@ class Craftax(Adapted):
     package: ClassVar[str] = "craftax"
     limit: ClassVar[str] = "max_timesteps"
     install: ClassVar[str] = "pip install craftax"
+    reset_batches: ClassVar[int] = 64  # to draw a world takes longer than hundreds of steps of one
 
     def made(self) -> tuple[Any, Any]:
         _ = self.module()
