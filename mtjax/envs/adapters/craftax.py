@@ -44,7 +44,7 @@ class Craftax(Adapted):
     package: ClassVar[str] = "craftax"
     limit: ClassVar[str] = "max_timesteps"
     install: ClassVar[str] = "pip install craftax"
-    reset_batches: ClassVar[int] = 64  # to draw a world takes longer than hundreds of steps of one
+    reset_batches: ClassVar[int] = 64  # to draw a world takes as long as seventy steps of one
 
     def made(self) -> tuple[Any, Any]:
         _ = self.module()
