@@ -507,6 +507,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env.vary.size=1,1", "must increase"),
         ("--env=finger-spin-vary-size --env.vary.size=1:1.1:4 --split=hip-bmdp", "has 4; use --split=dense"),
         ("--agent=care --agent.conditioning=none", "conditioning cannot be none"),
+        ("--agent=brc --agent.scaling=none", "and --agent.scaling=none does not keep them there; use --agent.scaling="),
         ("--agent.conditioning=vectors", "go together"),
         ("--agent.vectors=x.npy", "it belongs to conditioning='vectors'"),
         ("--agent.conditioning=vectors", "go together"),

@@ -362,7 +362,7 @@ def test_what_does_not_fit_the_run_is_refused(base, tmp_path, words, said):
         ("--from=nowhere", "'nowhere' is not a run"),
         ("--from=", "is not a run"),
         ("--tune=heads", "say which run: --from=RUN"),
-        ("--tune=embedding", "--agent.tune=embedding needs --agent.conditioning=embedding, not none"),
+        ("--tune=embedding", "--tune=embedding needs --agent.conditioning=embedding, not none"),
     ],
 )
 def test_flags_that_mean_nothing_are_refused(tmp_path, monkeypatch, words, said):

@@ -95,17 +95,18 @@ def check_flags_of(cls: type, argv: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def settings_as_flags() -> Iterator[None]:
-    """Write an agent's settings in errors as flags: ``scaling=none``, as Python has it, is ``--agent.scaling=none``."""
+    """Write settings in errors as flags: ``scaling=none``, as Python has it, is ``--agent.scaling=none``."""
     try:
         yield
     except InputError as error:
-        error.args = (_SETTING.sub(_as_flag_of_agent, str(error)),)
+        error.args = (_SETTING.sub(_flag_of, str(error)),)
         raise
 
 
-def _as_flag_of_agent(setting: re.Match) -> str:
-    flag = f"--agent.{as_flag(setting[1])}"
-    return f"{flag}=" if flag in all_flags() else setting[0]
+def _flag_of(setting: re.Match) -> str:
+    flags = (f"{prefix}{as_flag(setting[1])}" for prefix in ("--agent.", "--"))
+    flag = next((flag for flag in flags if flag in all_flags()), setting[1])
+    return f"{flag}="
 
 
 def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
