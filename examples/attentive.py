@@ -45,6 +45,7 @@ class Grid:
     """
 
     ends_early: ClassVar[bool] = True
+    reset_batches: ClassVar[int] = 16
     finite_horizon: ClassVar[bool] = False
     width: int = 7
     height: int = 7
