@@ -287,6 +287,8 @@ def test_the_number_of_tasks_decides_however_it_is_given():
     [
         ("finger-spin", "ppo", "gpu", "all", (11, None)),
         ("finger-spin", "ppo", "gpu", "sequence:20000", (2048, None)),
+        pytest.param("mt50", "ppo", "gpu", "all", (41, None), marks=needs("metaworld")),
+        pytest.param("mt50", "ppo", "gpu", "sequence:20000", (2048, None), marks=needs("metaworld")),
         pytest.param("mt50", "sac", "gpu", "shuffled:20000", (640, 1280), marks=needs("metaworld")),
         ("finger-spin", "sac", "gpu", "hardest:10:20000", (256, 64)),
         ("finger-spin", "sac", "cpu", "random:10:20000", (16, 32)),

@@ -289,7 +289,7 @@ def _change_tasks(
 
 
 def _reset_some(env: Env, tasks: Task, worlds: Worlds, ends: Ends, keys: Key, trials: Trials) -> tuple[_Begun, Array]:
-    """Reset worlds that have ended with keys (S, T, E), in batches, of which ``env.reset_batches`` hold all worlds."""
+    """Reset worlds that have ended with keys (S, T, E). A batch holds one in ``env.reset_batches`` of all worlds."""
     ended = ends.episode
     _, num_tasks, num_envs = ended.shape
     count, size = ended.size, -(-ended.size // env.reset_batches)
