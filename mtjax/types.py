@@ -255,7 +255,7 @@ class Spec(NamedTuple):
     obs: Any  # a tree of jax.ShapeDtypeStruct; for most families one vector (O,)
     action: Action
     context_size: int
-    mixed: bool = False  # whether entries of observations differ in meaning between tasks
+    mixed: bool = False  # whether tasks' observations are scaled each by itself, as their entries differ in meaning
     frames: int = 1  # how many of the last images an agent should see at once; observations hold the newest
     sentences: tuple[str, ...] = ()  # what the tasks of all splits ask for, by their numbers; for agents that read
     symbols: int = 0  # how many last entries of observations are the symbol of the sketch that is due, one-hot

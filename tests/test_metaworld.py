@@ -249,6 +249,7 @@ def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
     assert program.env == "ml10" and len(env.families) == 15 and env.train_count == 10
     assert all(family.goal_hidden and family.num_draws == 2 for family in env.families)
     assert [family.held_out for family in env.families] == [False] * 10 + [True] * 5
+    assert (env.spec.mixed, mtjax.make("mt10").spec.mixed) == (False, True)  # its test tasks have no units of their own
     (tmp_path / "config.json").write_text(to_json(program, {"command": "x"}))
     assert from_json(tmp_path / "config.json") == program
     assert env.labels("train")[0] == "metaworld-reach" and env.describe(0) == "metaworld-reach"  # draws are no tasks

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import types
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -455,6 +456,40 @@ def test_every_task_has_its_own_normaliser_and_padding_stays_zero():
     for i, width in enumerate((2, 2, 2, 3)):
         alone = normalize.update(normalize.init(width), obs[i, :, :width])
         np.testing.assert_allclose(seen[i, :, :width], normalize.apply(alone, obs[i, :, :width]), rtol=1e-5, atol=1e-6)
+
+
+@dataclasses.dataclass(frozen=True)
+class SameAim(Aim):
+    """What it observes means the same in all families of its kind."""
+
+    observes: ClassVar[str] = "aims"
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOutAim(SameAim):
+    """None of its tasks trains."""
+
+    @functools.cached_property
+    def variation(self):
+        found = super().variation
+        rows = {split: found.rows[split][:0] for split in SPLITS} | {"extrapolation": found.rows["train"]}
+        return dataclasses.replace(found, rows=rows)
+
+
+def test_tasks_of_a_family_that_does_not_train_are_seen_in_the_units_of_all_that_do():
+    """Where all observe the same. Else such a task has those of the first one, which mean something else."""
+    goals = {"vary": {"goal": "0,1"}, "split": "none"}
+    same = mixture([SameAim(**goals), HeldOutAim(vary={"goal": "5"}, split="none")])
+    assert same.counts == {"train": 2, "interpolation": 0, "extrapolation": 1}
+    others = mixture([SameAim(**goals), SameAim(vary={"goal": "5"}, split="none")])
+    apart = mixture([Aim(**goals), HeldOutAim(vary={"goal": "5"}, split="none")])
+    assert (same.spec.mixed, others.spec.mixed, apart.spec.mixed) == (False, True, True)
+    agent = tiny(normalize_observations=True)
+    obs = jnp.float32(np.random.default_rng(0).normal(size=(2, 50, 2)) * [[[1]], [[9]]] + [[[0]], [[4]]])
+    inputs = agent.view.count(init_inputs(same.spec, 2), obs)
+    together = normalize.update(normalize.init(2), obs)
+    np.testing.assert_allclose(agent.view.see(inputs, obs[0]), normalize.apply(together, obs[0]), rtol=1e-5, atol=1e-6)
+    assert not inputs.own  # so that no task, also of the other family, has moments of its own
 
 
 def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray | None) -> Params:

@@ -57,6 +57,7 @@ class Family(abc.ABC):
     relabels: ClassVar[tuple[str, ...]] = ()  # the parameters, goals all of them, that ``relabel`` can exchange
     forgets: ClassVar[bool] = False  # whether its worlds are lost with the process, and cannot be saved
     asks: ClassVar[str] = ""  # what its tasks ask for, in a sentence; empty: the documentation's first one
+    observes: ClassVar[str] = ""  # a name of what observations hold, that families share if every entry means the same
     finite_horizon: ClassVar[bool] = False  # how long an episode is, is part of the problem, and no mere limit of time
     fresh_goals: ClassVar[bool] = False  # every episode draws a goal of its own, whatever its task
     looks: ClassVar[Mapping[str, Parameter]] = MappingProxyType({})  # parameters that change only what is seen

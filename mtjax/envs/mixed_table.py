@@ -103,10 +103,16 @@ def mixed_spec(families: dict[str, Family], sentences: tuple[str, ...]) -> Spec:
         obs=frames.with_state(lambda _: widest, frames.joined(found[0].obs)),
         action=max((spec.action for spec in found), key=lambda action: action.size),
         context_size=mixed_contexts(list(families.values())).shape[1],
-        mixed=len(families) > 1,
+        mixed=len(families) > 1 and not _need_one_scale(list(families.values())),
         frames=found[0].frames,
         sentences=sentences,
     )
+
+
+def _need_one_scale(families: Sequence[Family]) -> bool:
+    """Return whether all tasks have one normaliser: all observe the same, and tasks of some family train none."""
+    observed = {family.observes for family in families}
+    return len(observed) == 1 and "" not in observed and any(not family.counts["train"] for family in families)
 
 
 def _require_one_look(specs: dict[str, Spec]) -> None:

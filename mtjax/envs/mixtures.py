@@ -43,6 +43,10 @@ class Mixture:
     Metrics: those of all families. They are NaN for a family that has no such metric.
     Reward, start, termination and time limit are each family's own.
 
+    Normaliser: each task has one of its own, as entries of observations mean something else in each family. An unseen
+        task takes that of its nearest training task. If all families observe the same (``Family.observes``), and some
+        of them does not train, all tasks have one together.
+
     A mixture of one family is that family: the same context, no mask, one normaliser.
     """
 

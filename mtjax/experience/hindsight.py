@@ -33,7 +33,7 @@ def require(env: Env) -> None:
     Raises:
         InputError: they cannot; it says why.
     """
-    if env.spec.mixed:
+    if len(getattr(env, "parts", ())) > 1:
         raise InputError("hindsight replays steps of one task as another's, and a mixture's tasks share no physics")
     if isinstance(env, Relabelling) and (env.pixels or env.repeat > 1):
         raise InputError("hindsight computes rewards from one step's state: leave out --env.pixels and --env.repeat")

@@ -81,6 +81,7 @@ class Sawyer(Domain):
     """Hold out as many goals of the next seed in the split extrapolation: those of ML1's test."""
 
     scene_file: ClassVar[str]  # a file in the package's assets/sawyer_xyz, without .xml
+    observes: ClassVar[str] = "hand, two things and goal"
     meshes: ClassVar[bool] = True
     unites: ClassVar[bool] = True
     hides: ClassVar = (_GOAL,)
