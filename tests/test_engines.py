@@ -6,8 +6,12 @@ and half another, so that a step which takes its model from the wrong row is off
 
 import gc
 import importlib.util
+import os
+import subprocess
+import sys
 import weakref
 from functools import lru_cache, partial
+from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
 
@@ -233,6 +237,26 @@ def test_host_functions_are_called_by_name():
     host.register("refuse", refuse)
     with pytest.raises(jax.errors.JaxRuntimeError, match="ValueError: no such world"):
         jax.block_until_ready(jax.jit(partial(host.call, "refuse", 2))(np.zeros(3, np.float32)))
+
+
+ENDS_EARLY = """
+import jax
+import jax.numpy as jnp
+import mtjax
+
+env = mtjax.make("finger-spin", engine="c")
+tasks = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, *x.shape[:1], 256, *x.shape[1:])), env.tasks())
+step = jax.jit(env.step_worlds)
+state = jax.jit(env.reset_worlds)(tasks, jax.random.split(jax.random.key(0), (1, 1, 256))).state
+for _ in range(200):
+    state = step(tasks, state, jnp.zeros((1, 1, 256, 2))).state
+"""
+
+
+def test_a_process_may_end_while_its_worlds_still_step():
+    """They are waited for: below a process that ends, a call would crash it."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(host.__file__).parents[3])}
+    subprocess.run([sys.executable, "-c", ENDS_EARLY], env=environment, check=True, timeout=120)
 
 
 def test_c_results_do_not_depend_on_what_the_batch_did_before():

@@ -6,6 +6,7 @@ the program for another process. A name means the same in every process that has
 The structures are the beginnings of those in ``xla/ffi/api/c_api.h``, whose binary layout XLA keeps stable.
 """
 
+import atexit
 import contextlib
 import ctypes
 import math
@@ -185,6 +186,14 @@ def explaining(also: Callable[[], str] = str) -> Iterator[None]:
         jax.jit(lambda: jax.debug.callback(lambda: None))()  # else JAX meets the failed program again as it exits
         told = "; ".join(text for text in (str(failure), also()) if text)
         raise InputError(told) from failure.__cause__
+
+
+@atexit.register
+def _finish() -> None:
+    """Wait for programs that still call functions here, as they would crash a process that ends below them."""
+    if _handlers:
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
+            jax.block_until_ready(jax.live_arrays())
 
 
 def _answer(query: _Query) -> None:
