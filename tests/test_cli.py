@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from conftest import SHORT_RUN
 from needs import needs
+from own_process import environment
 from probes import FEW, OFF_POLICY, family_for, one_in, slow_but
 
 import mtjax.evaluate
@@ -704,7 +705,7 @@ def test_record_of_another_version_is_told(complaint, finished_run, tmp_path):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--agent.hidden", "99999999"], "GB of networks, "),
+        (["--agent.hidden", "999999999"], "GB of networks, "),
         (["--replay-size=2147483647", "--num-envs=2"], "lower --replay-size, --num-envs or --seeds"),
     ],
 )
@@ -794,12 +795,10 @@ def test_errors_of_ours_are_not_hidden():
 )
 def test_errors_come_fast_and_without_traceback(tmp_path, words, said):
     """As a user meets them, in a process of their own."""
-    root = os.path.dirname(os.path.dirname(mtjax.__file__))
-    environment = {**os.environ, "PYTHONPATH": root}
     children = lambda: sum(os.times()[2:4])  # their processor time, as a busy machine is no fault of ours
     before = children()
     done = subprocess.run(
-        [sys.executable, "-m", *words], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", *words], cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300
     )
     seconds = children() - before
     assert done.returncode == 2 and said in done.stderr and done.stdout == ""

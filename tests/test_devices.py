@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from own_process import environment
 
 import mtjax
 import mtjax.train
@@ -149,11 +150,9 @@ def test_variables_that_mean_nothing_are_refused(monkeypatch, count, index):
 
 def python(*words, **variables):
     """Start a Python process of its own, on CPUs."""
-    root, path = str(HERE.parent), os.environ.get("PYTHONPATH", "")
-    common = {"JAX_PLATFORMS": "cpu", "MTJAX_CACHE": "0", "PYTHONPATH": f"{root}:{path}"}
-    environment = {**os.environ, **common, **variables}
+    env = environment(**{"JAX_PLATFORMS": "cpu", "MTJAX_CACHE": "0"} | variables)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen([sys.executable, *words], env=environment, cwd=HERE, **pipes)
+    return subprocess.Popen([sys.executable, *words], env=env, cwd=HERE, **pipes)
 
 
 @pytest.mark.slow

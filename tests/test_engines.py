@@ -6,12 +6,10 @@ and half another, so that a step which takes its model from the wrong row is off
 
 import gc
 import importlib.util
-import os
 import subprocess
 import sys
 import weakref
 from functools import lru_cache, partial
-from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
 
@@ -21,6 +19,7 @@ import mujoco
 import numpy as np
 import pytest
 from needs import needs, require
+from own_process import environment
 from probes import quick, slow_but
 
 from mtjax import envs
@@ -255,8 +254,7 @@ for _ in range(200):
 
 def test_a_process_may_end_while_its_worlds_still_step():
     """They are waited for: below a process that ends, a call would crash it."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(host.__file__).parents[3])}
-    subprocess.run([sys.executable, "-c", ENDS_EARLY], env=environment, check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", ENDS_EARLY], env=environment(), check=True, timeout=120)
 
 
 def test_c_results_do_not_depend_on_what_the_batch_did_before():

@@ -5,14 +5,12 @@ kernels of Warp with them last, as workers that start together would all compile
 """
 
 import dataclasses
-import os
 import signal
 import subprocess
 import sys
 import threading
 import time
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 from needs import needs
+from own_process import environment
 from probes import learn, random_batch, update, with_memory, with_nets
 from test_joined import require_as_alone
 from test_kills import outcome
@@ -243,17 +242,15 @@ def test_a_mixture_steps_as_its_families(sizes=(512, 64)):
 
 def test_a_run_that_is_killed_ends_as_any_other(tmp_path):
     """To the byte on MJX. Both runs execute the programs that the first of them compiled."""
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(mtjax.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]),
-        "MTJAX_CACHE": str(tmp_path / "cache"),
-        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # this process has memory of the same device
-    }
+    alike = environment(
+        MTJAX_CACHE=str(tmp_path / "cache"),
+        XLA_PYTHON_CLIENT_PREALLOCATE="false",  # this process has memory of the same device
+    )
 
     def start(*words):
         with (tmp_path / "out").open("a") as file:
             command = [sys.executable, "-m", "mtjax.train", *words]
-            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT)
+            return subprocess.Popen(command, env=alike, stdout=file, stderr=subprocess.STDOUT)
 
     def folder_in(runs):
         return next(iter(runs.glob("pendulum-*")), None)

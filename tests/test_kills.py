@@ -1,21 +1,19 @@
 """Real processes that are killed, stopped and started twice: the run that comes out is the one that nothing stopped."""
 
 import csv
-import os
 import random
 import re
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_process import environment
 
-import mtjax
 from mtjax.learning.evaluation import load_evaluations
 from mtjax.saved import checkpoint
 from mtjax.saved.config_json import from_json
@@ -33,13 +31,12 @@ LONGEST = 8.0  # seconds until a process is killed, of which it takes about half
 def start(tmp_path_factory):
     """Start a training process; its output is in a file."""
     cache, out = tmp_path_factory.mktemp("cache"), tmp_path_factory.mktemp("out") / "out"
-    root = str(Path(mtjax.__file__).parents[1])
-    environment = {**os.environ, "PYTHONPATH": root, "JAX_PLATFORMS": "cpu", "MTJAX_CACHE": str(cache)}
+    alike = environment(JAX_PLATFORMS="cpu", MTJAX_CACHE=str(cache))
 
     def start(*words, out=out):
         with out.open("w") as file:
             command = [sys.executable, "-m", "mtjax.train", *words]
-            return subprocess.Popen(command, env=environment, stdout=file, stderr=subprocess.STDOUT), out
+            return subprocess.Popen(command, env=alike, stdout=file, stderr=subprocess.STDOUT), out
 
     return start
 

@@ -7,11 +7,10 @@ import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from own_process import environment
 
-import mtjax
 from mtjax.command import process
 from mtjax.names import Notice, replacing
 from mtjax.saved import lock
@@ -31,11 +30,8 @@ with lock.hold(Path(sys.argv[1])):
 @pytest.fixture
 def other(tmp_path):
     """A process that holds the lock of the folder."""
-    root = str(Path(mtjax.__file__).parents[1])
     command = [sys.executable, "-c", HOLDER, str(tmp_path)]
-    with subprocess.Popen(
-        command, env={**os.environ, "PYTHONPATH": root}, stdout=subprocess.PIPE, text=True
-    ) as process:
+    with subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "held\n"
         yield process
         process.kill()

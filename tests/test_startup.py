@@ -8,12 +8,12 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 
 import pytest
 from mujoco import mjx
+from own_process import environment
 from probes import FEW, family_for, param
 
 import mtjax
@@ -43,11 +43,10 @@ finally:
 
 def run(module, words, asked, folder):
     """Run a command in a process of its own; returns its exit code, its output, and what of ``asked`` it imported."""
-    root = str(Path(mtjax.__file__).parents[1])
-    environment = {**os.environ, "PYTHONPATH": root, "MTJAX_CACHE": "0", "JAX_PLATFORMS": "cpu"}
+    env = environment(MTJAX_CACHE="0", JAX_PLATFORMS="cpu")
     given = json.dumps([module, words, asked])
     command = [sys.executable, "-c", SCRIPT, given]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=600)
     *output, imported = done.stdout.splitlines()
     return done.returncode, "\n".join([*output, done.stderr]), json.loads(imported)
 
@@ -97,10 +96,9 @@ def test_names_are_answered_without_jax(tmp_path, module, words, code, said):
 
 def test_a_reader_may_stop_early(tmp_path):
     """As ``head`` does; nothing is said of it."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(mtjax.__file__).parents[1])}
     command = [sys.executable, "-m", "mtjax.train", "--list"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, text=True, **pipes) as process:
+    with subprocess.Popen(command, cwd=tmp_path, env=environment(), text=True, **pipes) as process:
         process.stdout.close()
         assert process.stderr.read() == "" and process.wait(60) == 1
 

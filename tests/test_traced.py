@@ -9,13 +9,13 @@ import subprocess
 import sys
 import types
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_process import environment
 
 import mtjax
 from mtjax.compiling import programs, trace_cache
@@ -282,11 +282,10 @@ def test_changed_source_changes_the_key(monkeypatch, tmp_path):
 
 def command(words, cache):
     """Run a command in a process of its own; returns how often it traced a step."""
-    paths = [str(Path(mtjax.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "MTJAX_CACHE": str(cache)}
-    environment = {name: value for name, value in environment.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    env = environment(MTJAX_CACHE=str(cache))
+    env.pop("JAX_COMPILATION_CACHE_DIR", None)
     process = [sys.executable, "-c", SCRIPT, json.dumps(words)]
-    done = subprocess.run(process, env=environment, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(process, env=env, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
