@@ -165,7 +165,7 @@ class View:
 def init_inputs(spec: Spec, num_tasks: int) -> Params:
     """Return moments of no observations, with their layout unless networks take them as they are.
 
-    In a mixture each task has moments of its own, leaves (T, O).
+    Where each task is scaled by itself (``Spec.mixed``), it has moments of its own, leaves (T, O).
     """
     moments = normalize.init(max(frames.state_size(spec), 1))  # checkpoints hold no empty arrays
     layout = frames.layout(spec.obs)
