@@ -403,6 +403,22 @@ def test_the_policy_that_learns_is_the_one_that_played(way):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_inferred_changes_between_rollouts_alone(way):
+    """All updates of a rollout see what varibad and cadm inferred when it was played, so that with an actor that hardly
+    learns ratios stay 1; what infers learns meanwhile. Critics teach pearl within the rollout."""
+    agent = tiny("ppo", epochs=3, minibatches=2, actor_lr=1e-9, critic_lr=1e-2, **posterior(way))
+    agent = Ratios(**{field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)})
+    state, history = train(Walk(episode_length=4), agent, {"num_envs": 4, "unroll": 7, "chunk_steps": 35, "trials": 2})
+    ratio, nets = history[0]["ratio"].max(), only_seed(state.agent).nets
+    if way == "pearl":
+        assert ratio > 1e-3 and "belief" not in nets
+    else:
+        assert ratio < 1e-4
+        assert jax.tree.all(jax.tree.map(np.array_equal, nets["belief"], nets["knowing"]))
+
+
+@pytest.mark.slow
 def test_memory_lives_through_a_trial_and_is_new_after_it():
     """PEARL's sums, as a replay stores them: 0 where a trial begins, else what the step before has added to them."""
     agent = tiny("sac", recurrent_steps=4, **posterior("pearl"))

@@ -72,6 +72,8 @@ class BaseAgent(abc.ABC):
         actor, critic: what learns, beside the nets of a subclass.
         representation: of observations. The critics' loss trains it.
         knowing: of the task, which the critics' loss trains too.
+        belief: ``knowing`` as networks see it, in agents that learn from rollouts and where losses of its own alone
+            train it. It is that from before the updates of a rollout, so that the policy alone changes its ratio.
         tasks: what is known of the training tasks: their contexts (N, C), and given vectors (N, V), if any.
         inputs: the moments of observations; in a mixture one for each task, leaves (T, O). If observations are no
             vectors, there is also their layout, which joins their arrays.
@@ -330,6 +332,8 @@ class BaseAgent(abc.ABC):
         told = steps._replace(obs=None, action=None, next_obs=None, context=None, extras=None, memory=memory)
         told = jax.tree.map(lambda x: x.reshape(len(x), -1), collectives.whole(told, axis=2))
         new = {"inputs": self.view.count(state.nets["inputs"], steps.obs)}
+        if "belief" in state.nets:
+            new["belief"] = state.nets["knowing"]
         for name in WATCHERS:
             part: Watcher = getattr(self, name)
             after = told._replace(memory=part.remember(getattr(told.memory, name), told.reward, gamma))

@@ -70,7 +70,7 @@ class IMPALA(OnPolicy):
         state = super().init_networks(state, inputs, key)
         if not self.actor_lag:
             return state
-        older = {name: state.nets[name] for name in ("actor", "knowing", "inputs")}
+        older = {name: net for name, net in state.nets.items() if name in ("actor", "knowing", "belief", "inputs")}
         state = state._replace(slow=state.slow | jax.tree.map(jnp.copy, older))
         return state.with_nets(lag=Params({"rollouts": jnp.int32(0)}, {}))
 

@@ -166,6 +166,8 @@ class OnPolicy(BaseAgent):
         kept = self.continual.init(actor, num_tasks, inputs.actor, count)
         kept = kept | unit_resets.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, units=critics.Units.begin(num_tasks).params())
+        if self.conditioning.apart:
+            state = state.with_nets(belief=jax.tree.map(jnp.copy, state.nets["knowing"]))
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
 

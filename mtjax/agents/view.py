@@ -129,7 +129,8 @@ class View:
             features: those that need no learned parameters, (Z,) or (..., Z).
             seen: a result of ``see``.
         """
-        return self.conditioning.features(nets["knowing"].parts, features, seen), without_past(seen)
+        knowing = nets.get("belief", nets["knowing"])
+        return self.conditioning.features(knowing.parts, features, seen), without_past(seen)
 
     def actor_inputs(self, nets: Nets, features: Array, seen: Any) -> tuple[Array, Any]:
         """Return features (Z,) and inputs (..., O) of one task's actor, from what ``know`` takes."""

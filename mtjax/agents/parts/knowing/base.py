@@ -32,6 +32,11 @@ class Nothing:
         """Number of last steps from which features are made."""
         return 0
 
+    @property
+    def apart(self) -> bool:
+        """Whether losses of its own alone train it, so that networks may see it as it was before an update."""
+        return False
+
     def refuses(self) -> str:
         """Return why it cannot be used with these settings; empty if it can."""
         return ""
