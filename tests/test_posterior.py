@@ -405,17 +405,14 @@ def test_the_policy_that_learns_is_the_one_that_played(way):
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_what_is_inferred_changes_between_rollouts_alone(way):
-    """All updates of a rollout see what varibad and cadm inferred when it was played, so that with an actor that hardly
-    learns ratios stay 1; what infers learns meanwhile. Critics teach pearl within the rollout."""
+    """In all updates of a rollout the policy sees what was inferred when it was played: while an actor hardly learns,
+    ratios stay 1. What infers learns meanwhile, and is seen with the next rollout."""
     agent = tiny("ppo", epochs=3, minibatches=2, actor_lr=1e-9, critic_lr=1e-2, **posterior(way))
     agent = Ratios(**{field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)})
     state, history = train(Walk(episode_length=4), agent, {"num_envs": 4, "unroll": 7, "chunk_steps": 35, "trials": 2})
-    ratio, nets = history[0]["ratio"].max(), only_seed(state.agent).nets
-    if way == "pearl":
-        assert ratio > 1e-3 and "belief" not in nets
-    else:
-        assert ratio < 1e-4
-        assert jax.tree.all(jax.tree.map(np.array_equal, nets["belief"], nets["knowing"]))
+    nets = only_seed(state.agent).nets
+    assert history[0]["ratio"].max() < 1e-4
+    assert jax.tree.all(jax.tree.map(np.array_equal, nets["belief"], nets["knowing"]))
 
 
 @pytest.mark.slow

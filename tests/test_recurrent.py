@@ -87,19 +87,26 @@ def test_the_policy_that_learns_is_the_one_that_played():
 
 
 @pytest.mark.slow
-def test_each_loss_trains_the_memory_that_it_sees():
-    """In PPO actor and critic, through all steps of a window; in SAC the critics alone."""
+def test_the_actors_loss_trains_the_memory_in_ppo_and_the_critics_in_sac():
+    """Through all steps of a window."""
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **RECURRENT)
     state, steps = agent.init(SPEC, TASKS, KEY), rollout()
     state, steps = agent.assess(state, steps, TASKS)
     state, batch = agent.prepare(state, rollouts.windows(steps, agent.unroll), TASKS)
     nets, one = of_task(state.nets, 0), pick(batch._replace(mask=None), 0)
-    of_actor = jax.grad(lambda nets: agent.actor_loss(nets, one, KEY)[0])(nets)["knowing"]
-    of_critic = jax.grad(lambda nets: agent.critic_loss(nets, one)[0])(nets)["knowing"]
-    for slope in (of_actor, of_critic):
-        assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(slope))
-    assert agent.fits["actor"].names == ("actor", "knowing") and "knowing" in agent.fits["critic"].names
-    assert "knowing" not in tiny("sac", **RECURRENT).fits["actor"].names
+    slope = jax.grad(lambda nets: agent.actor_loss(nets, one, KEY)[0])(nets)["knowing"]
+    assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(slope))
+    teachers = lambda name: {fit for fit, made in tiny(name, **RECURRENT).fits.items() if "knowing" in made.names}
+    assert teachers("ppo") == {"actor"} and teachers("sac") == {"critic"}
+
+
+@pytest.mark.slow
+def test_critics_do_not_move_the_policy():
+    """Over all updates of a rollout ratios stay 1 while the actor hardly learns, though critics learn fast."""
+    agent = tiny("ppo", epochs=3, minibatches=2, actor_lr=1e-9, critic_lr=1e-2, **RECURRENT)
+    agent = Ratios(**{field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)})
+    _, history = train(Walk(episode_length=7), agent, {"num_envs": 4, "unroll": 5, "chunk_steps": 60})
+    assert history[0]["ratio"].max() < 1e-4
 
 
 def test_values_at_the_end_of_a_window_know_the_last_step():

@@ -71,9 +71,9 @@ class BaseAgent(abc.ABC):
     The networks of every agent, by name:
         actor, critic: what learns, beside the nets of a subclass.
         representation: of observations. The critics' loss trains it.
-        knowing: of the task, which the critics' loss trains too.
-        belief: ``knowing`` as networks see it, in agents that learn from rollouts and where losses of its own alone
-            train it. It is that from before the updates of a rollout, so that the policy alone changes its ratio.
+        knowing: of the task. The critics' loss trains it, or that of an actor that learns from rollouts.
+        belief: ``knowing`` as such an actor sees it, if other losses train it: that from before the updates of a
+            rollout, so that the policy moves by its own loss alone.
         tasks: what is known of the training tasks: their contexts (N, C), and given vectors (N, V), if any.
         inputs: the moments of observations; in a mixture one for each task, leaves (T, O). If observations are no
             vectors, there is also their layout, which joins their arrays.

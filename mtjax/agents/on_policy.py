@@ -166,7 +166,7 @@ class OnPolicy(BaseAgent):
         kept = self.continual.init(actor, num_tasks, inputs.actor, count)
         kept = kept | unit_resets.begin(self, {"actor": actor, "critic": critic})
         state = state.with_nets(**kept, actor=actor, critic=critic, units=critics.Units.begin(num_tasks).params())
-        if self.conditioning.apart:
+        if not self.conditioning.by_actor:
             state = state.with_nets(belief=jax.tree.map(jnp.copy, state.nets["knowing"]))
         slow = {"representation": state.nets["representation"]} if self.representation.learns else {}
         return state._replace(slow=jax.tree.map(jnp.copy, slow))
@@ -176,7 +176,9 @@ class OnPolicy(BaseAgent):
         found = super().fits
         if not self.conditioning.by_actor:
             return found
-        return found | {"actor": dataclasses.replace(found["actor"], names=("actor", "knowing"))}
+        # Critics' steps on what the policy sees would move it as far as its own do, and beyond its ratio's bounds.
+        names = {"actor": ("actor", "knowing"), "critic": ("critic", "representation")}
+        return {name: dataclasses.replace(fit, names=names[name]) for name, fit in found.items()}
 
     # Acting.
 

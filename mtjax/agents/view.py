@@ -129,11 +129,11 @@ class View:
             features: those that need no learned parameters, (Z,) or (..., Z).
             seen: a result of ``see``.
         """
-        knowing = nets.get("belief", nets["knowing"])
-        return self.conditioning.features(knowing.parts, features, seen), without_past(seen)
+        return self.conditioning.features(nets["knowing"].parts, features, seen), without_past(seen)
 
     def actor_inputs(self, nets: Nets, features: Array, seen: Any) -> tuple[Array, Any]:
         """Return features (Z,) and inputs (..., O) of one task's actor, from what ``know`` takes."""
+        nets = nets | {"knowing": nets.get("belief", nets["knowing"])}
         return self.representation.actor_inputs(nets["representation"], *self.know(nets, features, seen))
 
     def critic_inputs(self, nets: Nets, features: Array, seen: Any) -> tuple[Array, Any]:

@@ -14,7 +14,8 @@ class Nothing:
     """Shows networks nothing of their task.
 
     Every way of knowing a task is a class with these methods. What it learns is a network of the agent's, ``knowing``,
-    which the critics' loss trains. In agents that learn from rollouts the actor's loss trains it too, if ``by_actor``.
+    which the critics' loss trains. In agents that learn from rollouts the actor's loss trains it instead, so that the
+    policy moves by its own loss alone; but not what has a loss of its own (``join``).
     """
 
     borrowed: ClassVar[tuple[str, ...]] = ()  # names of what an unseen task uses of its nearest training task
@@ -24,18 +25,17 @@ class Nothing:
     embeds: ClassVar[bool] = False  # whether every training task has a learned vector, called embedding
     recurs: ClassVar[bool] = False  # whether features are a memory that learns, through the steps of a window
     burn_in: ClassVar[int] = 0  # first steps of a window that only renew that memory
-    by_actor: ClassVar[bool] = True  # whether the actor's loss trains it too, in agents that learn from rollouts
     draws: ClassVar[bool] = False  # whether its own loss needs a key
+
+    @property
+    def by_actor(self) -> bool:
+        """Whether the actor's loss trains it, in agents that learn from rollouts."""
+        return type(self).join is Nothing.join
 
     @property
     def history(self) -> int:
         """Number of last steps from which features are made."""
         return 0
-
-    @property
-    def apart(self) -> bool:
-        """Whether losses of its own alone train it, so that networks may see it as it was before an update."""
-        return False
 
     def refuses(self) -> str:
         """Return why it cannot be used with these settings; empty if it can."""

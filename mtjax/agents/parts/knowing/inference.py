@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -109,7 +109,6 @@ class Inference(abc.ABC):
     """Makes a memory of the steps of a trial, what networks see of it, and the losses by which it learns."""
 
     settings: Any  # of the conditioning
-    apart: ClassVar[bool] = True  # whether no loss of actor or critics trains it
 
     @abc.abstractmethod
     def modules(self, obs: Array, action: Array) -> dict[str, tuple]:
@@ -215,8 +214,6 @@ class VariBAD(Inference):
 
 class PEARL(Inference):
     """Reads every step by itself as a Gaussian, and multiplies these with the prior: their order does not matter."""
-
-    apart: ClassVar[bool] = False
 
     def modules(self, obs: Array, action: Array) -> dict[str, tuple]:
         read = jnp.zeros(2 * len(obs) + len(action) + 2)

@@ -35,8 +35,8 @@ class Posterior(Remembering):
     L is added to the critics' loss. In varibad and cadm no loss of actor or critics trains what infers the task; in
     pearl the critics' does, and the actor's does not. It learns through the steps of a window, which begins with the
     memory that acting had there, and the trial is as much of it as lies in the window: let a rollout hold whole trials.
-    In agents that learn from rollouts, networks see what varibad and cadm infer by the parameters that played the
-    rollout. Policy and values learn with these, and see new ones with the next rollout.
+    In agents that learn from rollouts, the policy sees what the parameters that played a rollout infer while it learns
+    from it.
 
     Differs from VariBAD: states are predicted too; it learns from the steps that actor and critics learn from, and not
     from a buffer of trials; L is divided by n. Differs from PEARL: the prior is one of the factors; networks see q, and
@@ -64,7 +64,6 @@ class Posterior(Remembering):
     backward_coefficient: float = 0.5
     """Weight of the prediction backward in time beside that forward (cadm)."""
 
-    by_actor: ClassVar[bool] = False
     draws: ClassVar[bool] = True
 
     def __post_init__(self):
@@ -73,10 +72,6 @@ class Posterior(Remembering):
         parts.require_counts(self, "latent_size", "recurrent_size", "inferred_from", "decoded_steps")
         parts.require_layers(self, "inference_widths")
         parts.require_not_negative(self, "kl_coefficient", "state_coefficient", "backward_coefficient")
-
-    @property
-    def apart(self) -> bool:
-        return self.way.apart
 
     @property
     def way(self) -> Inference:
