@@ -115,6 +115,7 @@ _MOST_LINES = 7  # of a figure
 UNFINISHED = "show the last evaluation of unfinished pairs too, marked with its steps"
 _FROM_PICTURES = ("drq", "sac-ae")  # from vectors they are plain conditioning
 _KEPT = ("seed", "steps", "seconds", "wall_seconds", "return")
+_DIAGNOSES = ("success", "entropy", "kl", "clip_fraction", "explained_variance", "critic_loss")
 _CONFLICTS = ("critic_cosine", "critic_conflict", "actor_cosine", "actor_conflict")
 
 
@@ -254,7 +255,7 @@ def seeing(agent: str, settings: dict) -> dict[str, Any]:
 def save(folder: Path, agent: str, result: Result) -> None:
     """Save one run. The evaluations come last, because they mark it as complete."""
     folder.mkdir(parents=True, exist_ok=True)
-    kept = [name for name in (*_KEPT, *_CONFLICTS) if name in result.rows[-1]]
+    kept = [name for name in (*_KEPT, *_DIAGNOSES, *_CONFLICTS) if name in result.rows[-1]]
     write_lines(folder / f"{agent}.csv", [{name: row[name] for name in kept} for row in result.rows])
     save_evaluations(folder / f"{agent}.npz", result.evaluations)
 

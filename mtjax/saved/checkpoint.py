@@ -29,7 +29,7 @@ from mtjax.types import InputError
 
 _KEPT = 2
 _RECORD = "config.json"  # beside the folder of checkpoints
-_FORMAT = 4  # counts the changes of the training state's structure
+_FORMAT = 5  # counts the changes of the training state's structure
 _FORMAT_FILE = "format.txt"  # checkpoints without one are of format 1
 _SUMS = "checksums.txt"  # as of sha256sum, by which users can check them too
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
