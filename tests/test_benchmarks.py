@@ -795,7 +795,7 @@ def test_ways_that_need_others_begin_once_these_are_done(script, tmp_path, monke
     assert stages == begun
 
 
-@pytest.mark.parametrize("name", ["compare", "parts", "ppo_peer", "rejax_peer", "scaling"])
+@pytest.mark.parametrize("name", ["compare", "parts", "ppo_peer", "pqn_peer", "rejax_peer", "scaling"])
 def test_benchmarks_whose_parts_hold_the_device_import_no_jax(name):
     code = f"import sys; sys.path.insert(0, {str(FOLDER)!r}); import {name}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
@@ -821,6 +821,23 @@ def test_updates_are_timed_as_the_loop_makes_them(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["update_cost.py", *flags])
     script("update_cost").main()
     assert [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[2:4]] == ["| sac", "| care"]
+
+
+def test_pqn_is_beside_its_authors(script, tmp_path):
+    """A line for each game and side, with the mean and the range of seeds; numbers of their settings are numbers."""
+    pqn_peer, parts = script("pqn_peer"), script("parts")
+    assert "| game | side |" in pqn_peer.tabulate(tmp_path)
+    of = {"game": "Breakout", "steps": 10_000, "seconds": 9.6, "compile_seconds": 2}
+    for side, scores in ("mtjax", [4.0, 4.5, 5.0]), ("purejaxql", [2.0, 2.5, 3.0]):
+        parts.write_result(tmp_path / f"Breakout-{side}.json", of | {"side": side, "scores": scores})
+    lines = pqn_peer.tabulate(tmp_path).splitlines()
+    assert lines[2] == "| Breakout | mtjax | 3 | 10,000 | 4.5 [4.0, 5.0] | 4.0 to 5.0 | 10 | 2 |"
+    assert "| 2.5 [2.0, 3.0] | 2.0 to 3.0 |" in lines[3]
+    file = tmp_path / "pqn.yaml"
+    file.write_text("TOTAL_TIMESTEPS: 1e7\nLR: 0.0005\nNUM_ENVS: 128\nNORM_TYPE: layer_norm\n")
+    assert pqn_peer.settings_of(file) == {
+        "TOTAL_TIMESTEPS": 1e7, "LR": 0.0005, "NUM_ENVS": 128, "NORM_TYPE": "layer_norm"
+    }  # fmt: skip
 
 
 # Scales and halving.
