@@ -69,6 +69,28 @@ def run_ways(
     require_all(left)
 
 
+def run_pairs(
+    script: str,
+    arguments: argparse.Namespace,
+    pairs: Sequence[tuple[Any, Any]],
+    play: Callable[..., None],
+    table: Callable[[Path], str],
+) -> None:
+    """Play a pair if ``--part`` names it. Else run all that have no result yet, and print the table.
+
+    Args:
+        pairs: of two words each, whose parts are given all flags of this call too.
+        play: of the arguments and the two words of a pair.
+    """
+    if arguments.part:
+        return play(arguments, *arguments.part)
+    words = lambda pair: [*sys.argv[1:], "--out", str(arguments.out), "--part", *map(str, pair)]
+    named = [Part("-".join(map(str, pair)), words(pair)) for pair in pairs]
+    left = run_parts(script, named, arguments.out, arguments)
+    print(table(arguments.out))
+    require_all(left)
+
+
 def _of_way(arguments: argparse.Namespace, way: str) -> Part:
     """Return the part of a way, with all that was given to its benchmark but how to run parts."""
     words = ["--ways", way]

@@ -47,15 +47,8 @@ def main() -> None:
     parser.add_argument("--part", nargs=2, metavar=("GAME", "SIDE"), help="run this part in this process")
     parts.add_flags(parser)
     arguments = parser.parse_args()
-    if arguments.part:
-        play(arguments, *arguments.part)
-        return
-    words = lambda game, side: [*sys.argv[1:], "--out", str(arguments.out), "--part", game, side]
-    named = [(game, side) for game in arguments.games for side in arguments.sides]
-    of_all = [parts.Part(f"{game}-{side}", words(game, side)) for game, side in named]
-    left = parts.run_parts(__file__, of_all, arguments.out, arguments)
-    print(tabulate(arguments.out))
-    parts.require_all(left)
+    pairs = [(game, side) for game in arguments.games for side in arguments.sides]
+    parts.run_pairs(__file__, arguments, pairs, play, tabulate)
 
 
 def play(arguments: argparse.Namespace, game: str, side: str) -> None:
@@ -74,7 +67,7 @@ def theirs(arguments: argparse.Namespace, game: str) -> dict[str, Any]:
     from purejaxql import pqn_minatar  # type: ignore  # not a dependency of this package
 
     pqn_minatar.LogWrapper = with_one_end(pqn_minatar.LogWrapper)
-    settings = settings_of(Path(pqn_minatar.__file__).parent / "config/alg/pqn_minatar.yaml")
+    settings = authors_settings(Path(pqn_minatar.__file__).parent / "config/alg/pqn_minatar.yaml")
     given = {"ENV_NAME": game, "WANDB_MODE": "disabled", "TOTAL_TIMESTEPS": arguments.steps}
     settings |= given | {"TOTAL_TIMESTEPS_DECAY": arguments.steps}
     keys = jax.random.split(jax.random.PRNGKey(0), arguments.seeds)
@@ -115,7 +108,7 @@ def with_one_end(wrapper: Any) -> Any:
     return OneEnd
 
 
-def settings_of(path: Path) -> dict[str, Any]:
+def authors_settings(path: Path) -> dict[str, Any]:
     """Read the authors' settings, whose numbers with an exponent YAML takes for words."""
     import yaml
 

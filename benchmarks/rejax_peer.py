@@ -16,7 +16,6 @@ interrupted comparison goes on. All results in OUT give ``OUT/table.md``.
 """
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -44,19 +43,13 @@ def main() -> None:
     parser.add_argument("--part", nargs=2, metavar=("SIDE", "SEEDS"), help="run this part in this process")
     parts.add_flags(parser)
     arguments = parser.parse_args()
-    if arguments.part:
-        play(arguments, arguments.part[0], int(arguments.part[1]))
-        return
-    words = lambda side, seeds: [*sys.argv[1:], "--out", str(arguments.out), "--part", side, str(seeds)]
-    named = [(side, seeds) for seeds in arguments.seeds for side in arguments.sides]
-    of_all = [parts.Part(f"{side}-{seeds}", words(side, seeds)) for side, seeds in named]
-    left = parts.run_parts(__file__, of_all, arguments.out, arguments)
-    print(tabulate(arguments.out))
-    parts.require_all(left)
+    pairs = [(side, seeds) for seeds in arguments.seeds for side in arguments.sides]
+    parts.run_pairs(__file__, arguments, pairs, play, tabulate)
 
 
-def play(arguments: argparse.Namespace, side: str, seeds: int) -> None:
+def play(arguments: argparse.Namespace, side: str, number: str) -> None:
     """Run one side with a number of seeds, and write its result."""
+    seeds = int(number)
     found = theirs(arguments.steps, seeds) if side == "rejax" else ours(arguments.steps, seeds, side)
     figures = {"side": side, "seeds": seeds, "process_seconds": parts.since_start(), **found}
     parts.write_result(arguments.out / f"{side}-{seeds}.json", record(arguments, figures))

@@ -835,7 +835,7 @@ def test_pqn_is_beside_its_authors(script, tmp_path):
     assert "| 2.5 [2.0, 3.0] | 2.0 to 3.0 |" in lines[3]
     file = tmp_path / "pqn.yaml"
     file.write_text("TOTAL_TIMESTEPS: 1e7\nLR: 0.0005\nNUM_ENVS: 128\nNORM_TYPE: layer_norm\n")
-    assert pqn_peer.settings_of(file) == {
+    assert pqn_peer.authors_settings(file) == {
         "TOTAL_TIMESTEPS": 1e7, "LR": 0.0005, "NUM_ENVS": 128, "NORM_TYPE": "layer_norm"
     }  # fmt: skip
 

@@ -256,7 +256,8 @@ def test_stop_ends_an_option_and_the_other_outputs_say_what_it_does():
     head = {"kernel": jnp.zeros((OPTIONS, 16, 3)), "bias": jnp.log(jnp.float32([[1, 2, 3], [1, 1, 2]]))}
     actor = state.nets["actor"]
     state = state.with_nets(actor=actor._replace(shared=actor.shared | {"head": head}))
-    assert "termination" not in state.nets and {*LEARNS["stop"]} <= {*learned(agent.fits.values())}
+    found = learned(agent.fits.values())
+    assert "termination" not in state.nets and found == ("critic", "representation", "actor", "knowing", "over_options")
     nets, before = of_task(state.nets, 0), jnp.int32([0, 1, 0])
     np.testing.assert_allclose(ending(agent, nets, TASKS.context[0], EYE, before), [0.5, 0.5, 0.5], rtol=1e-6)
     masked = ending(agent, nets, TASKS.context[0], EYE, before, jnp.float32([0, 1]))

@@ -139,7 +139,7 @@ def rollout(agent):
 
 
 @pytest.mark.slow
-def test_each_loss_trains_all_of_it():
+def test_each_loss_reaches_all_of_it():
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **SETTINGS)
     state = agent.init(SPEC, TASKS, KEY)
     state, steps = agent.assess(state, rollout(agent), TASKS)

@@ -14,7 +14,7 @@ class Nothing:
     """Shows networks nothing of their task.
 
     Every way of knowing a task is a class with these methods. What it learns is a network of the agent's, ``knowing``,
-    which the critics' loss trains. In agents that learn from rollouts the actor's loss trains it instead, so that the
+    which the critics' loss trains. In agents that learn an actor from rollouts its loss trains it instead, so that the
     policy moves by its own loss alone; but not what has a loss of its own (``join``).
     """
 
@@ -29,7 +29,7 @@ class Nothing:
 
     @property
     def by_actor(self) -> bool:
-        """Whether the actor's loss trains it, in agents that learn from rollouts."""
+        """Whether the actor's loss trains it, in agents that learn an actor from rollouts."""
         return type(self).join is Nothing.join
 
     @property

@@ -35,8 +35,7 @@ class Posterior(Remembering):
     L is added to the critics' loss. In varibad and cadm no loss of actor or critics trains what infers the task; in
     pearl the critics' does, and the actor's does not. It learns through the steps of a window, which begins with the
     memory that acting had there, and the trial is as much of it as lies in the window: let a rollout hold whole trials.
-    In agents that learn from rollouts, the policy sees what the parameters that played a rollout infer while it learns
-    from it.
+    An actor that learns from rollouts sees what the parameters that played a rollout infer while it learns from it.
 
     Differs from VariBAD: states are predicted too; it learns from the steps that actor and critics learn from, and not
     from a buffer of trials; L is divided by n. Differs from PEARL: the prior is one of the factors; networks see q, and
