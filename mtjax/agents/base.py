@@ -234,7 +234,7 @@ class BaseAgent(abc.ABC):
         """The gradient steps of the agent, by name: which networks learn together, and how."""
         adam = partial(descent.adam, weight_decay=self.weight_decay, max_norm=self.max_gradient_norm, tune=self.tune)
         actor = adam(scheduled(self, self.actor_lr, self.experience.policy_delay))
-        critic = descent.paced(adam(scheduled(self, self.critic_lr)), self.conditioning.paces)
+        critic = adam(scheduled(self, self.critic_lr))
         fit = partial(Fit, per_layer=self.gradient_scope == "per-layer", over_devices=self.devices_differ)
         return {
             "critic": fit(("critic", "representation", "knowing"), critic, self.gradients),

@@ -1,6 +1,6 @@
 """Optimisers and optimiser steps for actor and critics, and schedules of their learning rates."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
@@ -76,17 +76,6 @@ def on_sphere(optimizer: optax.GradientTransformation) -> optax.GradientTransfor
     def step(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
         updates, state = optimizer.update(updates, state, params)
         return jax.tree_util.tree_map_with_path(stay, updates, params), state
-
-    return optax.GradientTransformation(optimizer.init, step)
-
-
-def paced(optimizer: optax.GradientTransformation, paces: Mapping[str, float]) -> optax.GradientTransformation:
-    """Return an optimiser of networks by name, whose steps of those that ``paces`` names are so many times as long."""
-
-    def step(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        updates, state = optimizer.update(updates, state, params)
-        scale = lambda pace, update: jax.tree.map(lambda x: pace * x, update)
-        return updates | {name: scale(pace, updates[name]) for name, pace in paces.items()}, state
 
     return optax.GradientTransformation(optimizer.init, step)
 

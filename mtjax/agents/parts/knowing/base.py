@@ -28,11 +28,6 @@ class Nothing:
     draws: ClassVar[bool] = False  # whether its own loss needs a key
 
     @property
-    def paces(self) -> dict[str, float]:
-        """How long its steps are beside those of the critics, with whose loss it learns, by the network's name."""
-        return {}
-
-    @property
     def by_actor(self) -> bool:
         """Whether the actor's loss trains it, in agents that learn an actor from rollouts."""
         return type(self).join is Nothing.join

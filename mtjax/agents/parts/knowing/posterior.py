@@ -63,9 +63,6 @@ class Posterior(Remembering):
     backward_coefficient: float = 0.5
     """Weight of the prediction backward in time beside that forward (cadm)."""
 
-    inference_pace: float = 1.0
-    """Learning rate of what infers the task, as a share of the critics'."""
-
     draws: ClassVar[bool] = True
 
     def __post_init__(self):
@@ -73,12 +70,7 @@ class Posterior(Remembering):
         parts.require_choices(self)
         parts.require_counts(self, "latent_size", "recurrent_size", "inferred_from", "decoded_steps")
         parts.require_layers(self, "inference_widths")
-        parts.require_positive(self, "inference_pace")
         parts.require_not_negative(self, "kl_coefficient", "state_coefficient", "backward_coefficient")
-
-    @property
-    def paces(self) -> dict[str, float]:  # type: ignore[override]
-        return {"knowing": self.inference_pace}
 
     @property
     def way(self) -> Inference:
