@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import parts
+from mtjax import frames
+from mtjax.agents import combinations, parts
 from mtjax.agents.base import BaseAgent, HeadsOfOne, Inputs, Memory
 from mtjax.agents.fit import Fit, Losses, descend
 from mtjax.agents.hyperparameters import FLAT
@@ -15,11 +16,13 @@ from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.policies.categorical import allowed
+from mtjax.agents.parts.representations import Asymmetric
 from mtjax.agents.parts.samplers import Uniform
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import Rollouts
 from mtjax.experience.rollouts import played, windows
+from mtjax.parallel.axes import in_parts
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 
@@ -82,8 +85,9 @@ class PQN(BaseAgent):
         super().__post_init__()
         parts.require_shares(self, "q_lambda", "epsilon")
         parts.require_counts(self, "epsilon_rollouts")
-        if self.representation.learns:
-            raise InputError("pqn learns values of observations as they are; use representation=plain")
+        if self.representation.models or isinstance(self.representation, Asymmetric):
+            raise InputError("pqn learns from the loss of its values alone; use representation=plain or encoded")
+        combinations.refuse_of_replay(self)
         if self.scaling.rescales or type(self.sampler) is not Uniform:
             raise InputError("pqn keeps its heads, and learns all tasks alike: no scaling=popart, and sampler=uniform")
 
@@ -141,7 +145,11 @@ class PQN(BaseAgent):
 
     def values(self, state: AgentState, features: Array, obs: Any, tasks: Task) -> Array:
         """Return the values (T, B, A) of all actions; those that a task does not have are worth nothing at all."""
-        found = over_tasks(self.q, state.nets, features, obs)
+        of_tasks = partial(over_tasks, self.q, state.nets)
+        if frames.shown(obs):  # all at once they would fill the memory
+            found = in_parts(of_tasks, features, obs, self.experience.minibatches)
+        else:
+            found = of_tasks(features, obs)
         return allowed(found, None if tasks.action_mask is None else tasks.action_mask[:, None])
 
     def update(

@@ -59,6 +59,8 @@ def draft(argv: Sequence[str]) -> RunConfig:
         value = flag_value(argv, f"env.{name.replace('_', '-')}", "")
         if value.isdecimal():
             of_family[name] = int(value)
+    if "--env.pictures" in argv:
+        of_family["pictures"] = True
     if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
     given = {name.replace("-", "_"): flag_value(argv, f"agent.{name}", "") for name in _DECIDING}
