@@ -72,6 +72,8 @@ class Cells(nn.Module):
 
 
 NETWORKS: dict[str, type[nn.Module]] = {"drq": Convolutions, "impala": Residual, "grid": Cells}
+LEAST: dict[str, int] = {"drq": 15, "impala": 1, "grid": 3}
+"""Height and width of the smallest pictures that each network takes."""
 
 
 def project(features: Array, size: int) -> Array:

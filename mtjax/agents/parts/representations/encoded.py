@@ -13,7 +13,7 @@ from mtjax.agents import parts
 from mtjax.agents.networks import MLP, OVER_TASKS, Network, Params
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.base import Plain
-from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project, shift_pictures
+from mtjax.agents.parts.vision import LEAST, NETWORKS, Projection, Vision, project, shift_pictures
 from mtjax.types import Array, InputError, Key, Transition
 
 ENCODERS = ("latent",)
@@ -43,9 +43,9 @@ def require_visible(encoded: "Encoded", obs: Any) -> None:
     if not frames.shown(obs):
         parts.require_layers(encoded, "latent_widths")
         return
-    network, picture = NETWORKS[encoded.vision](), obs[frames.PICTURES]
-    if not jax.eval_shape(network.init_with_output, jax.eval_shape(jax.random.key, 0), picture)[0].size:
-        told = f"pictures {picture.shape} are too small for vision={encoded.vision}"
+    picture, least = obs[frames.PICTURES].shape, LEAST[encoded.vision]
+    if min(picture[:2]) < least:
+        told = f"vision={encoded.vision} takes pictures of at least {least} x {least}, not {picture}"
         raise InputError(f"{told}; for grids of few cells use --agent.vision=grid")
 
 
@@ -102,7 +102,7 @@ class Encoded(Plain):
         swept = isinstance(self.encoder_tau, jax.Array)
         return self.slow if not swept and self.encoder_tau == 1 else ()
 
-    require = require_visible
+    require = require_visible  # type: ignore[override]
 
     def augment(self, batch: Transition, key: Key) -> Transition:
         return shift_pictures(batch, key, self.shift)
