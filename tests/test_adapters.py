@@ -268,8 +268,9 @@ def test_grids_are_shown_as_pictures_where_they_are_grids():
     assert (shown.pixels, shown.spec.frames) == (10, 1)
     assert shown.spec.obs == {"pixels": jax.ShapeDtypeStruct((10, 10, 7), np.uint8)}
     assert mtjax.make("gymnax:Freeway-MinAtar").spec.obs_size == 700
-    space = mtjax.gym.make("gymnax:Freeway-MinAtar", pictures=True).observation_space
-    assert (space.shape, space.dtype) == ((10, 10, 7), np.uint8)
+    env = mtjax.gym.make("gymnax:Freeway-MinAtar", pictures=True)
+    seen, space = env.reset(seed=0)[0]["env_obs"], env.observation_space["env_obs"]
+    assert (space.shape, space.dtype) == ((10, 10, 7), np.uint8) and seen in space and seen.max() == 255
     for name in ("CartPole-v1", "Catch-bsuite", "Pong-misc"):
         with pytest.raises(InputError, match=rf"{name} observes no picture \(H, W, C\) .*; leave out pictures"):
             mtjax.make(f"gymnax:{name}", pictures=True)
