@@ -5,16 +5,18 @@
 
     purejaxql    ``make_train`` of its ``pqn_minatar.py`` with the settings of its ``pqn_minatar.yaml``
     mtjax        ``python -m mtjax.train --env=gymnax:GAME-MinAtar --agent=pqn --preset=gpu --split=none``
+    mtjax-conv   the same with ``--env.pictures``
 
 The first needs a clone of github.com/mttga/purejaxql (47af6d7) on PYTHONPATH. It was written for gymnax 0.0.6, whose
 steps tell one end. Both sides play the games of gymnax 1.0; theirs are told its two ends as one. What purejaxql imports
 and does not need here (wandb, hydra, omegaconf) may be missing.
 
-Steps, worlds, rollouts, passes, minibatches, rates and exploration are the same. Networks differ: a convolution of 16
-channels and a layer of 128 there, two layers of 128 here; so do optimisers, RAdam there and Adam here. Both are
-evaluated at the end under the best actions. There the score is the mean over all episodes that end in 128 worlds within
-one limit of steps, so that short ones count more; here over ``--episodes`` whole episodes of each seed. Seconds are
-those of the run, with 20 evaluations there and one here; compiling is apart.
+Steps, worlds, rollouts, passes, minibatches, rates and exploration are the same. The network is a convolution of 16
+channels and a layer of 128 there and in mtjax-conv, two layers of 128 in mtjax. There its input is 0 or 1/255, here 0
+or 1. Optimisers differ: RAdam there, Adam here. All are evaluated at the end under the best actions. There the score is
+the mean over all episodes that end in 128 worlds within one limit of steps, so that short ones count more; here over
+``--episodes`` whole episodes of each seed. Seconds are those of the run, with 20 evaluations there and one here;
+compiling is apart.
 
 Every game and side is a process of its own, which writes ``OUT/GAME-SIDE.json``; ``parts.py`` says how an interrupted
 comparison goes on. All results in OUT give ``OUT/table.md``: means with 95% intervals over seeds.
@@ -32,7 +34,7 @@ import parts
 from report import markdown, record, run_main
 
 GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
-SIDES = ("purejaxql", "mtjax")
+SIDES = ("purejaxql", "mtjax", "mtjax-conv")
 
 
 def main() -> None:
@@ -53,7 +55,8 @@ def main() -> None:
 
 def play(arguments: argparse.Namespace, game: str, side: str) -> None:
     """Learn one game by one side, and write its result."""
-    found = (theirs if side == "purejaxql" else ours)(arguments, f"{game}-MinAtar")
+    name = f"{game}-MinAtar"
+    found = theirs(arguments, name) if side == "purejaxql" else ours(arguments, name, pictures=side == "mtjax-conv")
     result = record(arguments, {"game": game, "side": side, **found})
     parts.write_result(arguments.out / f"{game}-{side}.json", result)
 
@@ -116,11 +119,11 @@ def authors_settings(path: Path) -> dict[str, Any]:
     return {name: number(x) for name, x in yaml.safe_load(path.read_text()).items()}
 
 
-def ours(arguments: argparse.Namespace, game: str) -> dict[str, Any]:
+def ours(arguments: argparse.Namespace, game: str, pictures: bool) -> dict[str, Any]:
     """Learn a game by ours, all seeds in one program, and return seconds and scores."""
     import mtjax
 
-    config = mtjax.preset(f"gymnax:{game}", "pqn", "gpu", split="none")
+    config = mtjax.preset(f"gymnax:{game}", "pqn", "gpu", split="none", pictures=pictures)
     result = mtjax.train(
         *(config.family, config.learner),
         settings=config.training,
@@ -135,7 +138,7 @@ def ours(arguments: argparse.Namespace, game: str) -> dict[str, Any]:
         "compile_seconds": result.compile_seconds,
         "seconds": result.total_seconds - result.compile_seconds,
         "scores": result.evaluations.returns["train"][:, -1].mean(axis=(1, 2)).tolist(),
-        "choices": {"worlds": config.training.num_envs, "hidden": config.learner.hidden},
+        "choices": {"worlds": config.training.num_envs, "hidden": config.learner.hidden, "pictures": pictures},
     }
 
 

@@ -7,7 +7,10 @@ import pytest
 from needs import needs, require
 
 import mtjax
+import mtjax.gym
 from mtjax import envs
+from mtjax.agents.parts.representations import Encoded
+from mtjax.command.run_config import parse
 from mtjax.envs.adapters.family import AdaptedState
 from mtjax.envs.adapters.xminigrid import XMiniGrid
 from mtjax.types import InputError
@@ -46,6 +49,7 @@ def own_params(nominal, task, **limit):
     [
         ("CartPole-v1", {"vary": {"length": "0.25,1"}, "split": "none", "time_limit": 25}, (True, True)),
         ("Breakout-MinAtar", {}, (True, False)),
+        ("Seaquest-MinAtar", {"pictures": True}, (True, False)),
         ("Asterix-MinAtar", {"vary": {"shot-cool-down": "3,7"}, "split": "none"}, (True, False)),
         ("Pendulum-v1", {"vary": {"g": "5:15:2"}, "split": "none"}, (False, True)),
         ("FourRooms-misc", {"time_limit": 40}, (False, True)),
@@ -65,10 +69,14 @@ def test_steps_of_gymnax_are_the_originals(name, settings, kinds):
         def original(state, action, params=params):
             given = action if family.discrete else low + (action + 1) / 2 * (high - low)
             _, _, reward, terminated, truncated, info = environment.step(state.step_key, state.world, given, params)
-            return info["final_observation"].astype(jnp.float32).ravel(), reward, terminated, truncated
+            return info["final_observation"].astype(jnp.float32), reward, terminated, truncated
 
         ours, theirs = play(family, task, original)
-        np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-6, atol=1e-6)
+        if family.pixels:
+            np.testing.assert_array_equal(ours[0]["pixels"], 255 * theirs[0])
+            assert ours[0]["pixels"].dtype == np.uint8 and set(np.unique(theirs[0])) == {0, 1}
+        else:
+            np.testing.assert_allclose(ours[0], theirs[0].reshape(len(theirs[0]), -1), rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(ours[2], theirs[2])
         np.testing.assert_array_equal(ours[3], theirs[3])
@@ -251,6 +259,34 @@ def test_scales_multiply_the_rewards_of_games():
     small, plain, large = (rewards for _, rewards, *_ in each)
     assert plain.max() == 1
     np.testing.assert_allclose([small, large], [0.01 * plain, 100 * plain], rtol=1e-6)
+
+
+@needs("gymnax")
+def test_grids_are_shown_as_pictures_where_they_are_grids():
+    """To Gymnasium's view too. Arrays of other shapes, and of other numbers as Pong's, are none."""
+    shown = mtjax.make("gymnax:Freeway-MinAtar", pictures=True)
+    assert (shown.pixels, shown.spec.frames) == (10, 1)
+    assert shown.spec.obs == {"pixels": jax.ShapeDtypeStruct((10, 10, 7), np.uint8)}
+    assert mtjax.make("gymnax:Freeway-MinAtar").spec.obs_size == 700
+    env = mtjax.gym.make("gymnax:Freeway-MinAtar", pictures=True)
+    seen, space = env.reset(seed=0)[0]["env_obs"], env.observation_space["env_obs"]
+    assert (space.shape, space.dtype) == ((10, 10, 7), np.uint8) and seen in space and seen.max() == 255
+    for name in ("CartPole-v1", "Catch-bsuite", "Pong-misc"):
+        with pytest.raises(InputError, match=rf"{name} observes no picture \(H, W, C\) .*; leave out pictures"):
+            mtjax.make(f"gymnax:{name}", pictures=True)
+
+
+@needs("gymnax")
+def test_pictures_of_games_choose_the_network_of_their_paper():
+    """By the preset, on either device and from a command line; vectors keep their layers."""
+    for device in ("cpu", "gpu"):
+        flags = ["--env=gymnax:Asterix-MinAtar", "--agent=pqn", f"--preset={device}"]
+        seeing, plain = parse([*flags, "--env.pictures"]), parse(flags)
+        learner = mtjax.preset("gymnax:Asterix-MinAtar", "pqn", device, pictures=True).learner
+        assert seeing.family.pictures and seeing.learner == learner and not plain.family.pictures
+        assert learner.representation == Encoded(latent_widths=(), vision="grid") and learner.hidden == (128,)
+        assert not plain.learner.representation.learns and plain.learner.hidden == (128, 128)
+        assert seeing.learner.experience == plain.learner.experience and seeing.training == plain.training
 
 
 @needs("gymnax")

@@ -199,7 +199,7 @@ def test_presets_name_only_what_there_is(file):
     known["pictures"] = known["training"] | fields(Plan)
     of_agents = fields(Settings) | fields(Plan) | {"worlds", "tuned_tasks"}
     known |= {name: set(settings_of(mtjax.agent(name))) | of_agents for name in AGENTS}
-    seeing = {name: set(settings_of(mtjax.agent(name, representation="encoded"))) for name in ("ppo", "impala")}
+    seeing = {name: set(settings_of(mtjax.agent(name, representation="encoded"))) for name in ("ppo", "impala", "pqn")}
     known |= {f"{name}-pictures": settings | of_agents for name, settings in seeing.items()}
     for tables in preset.values():
         for table, settings in tables.items():

@@ -77,6 +77,7 @@ MARKS: dict[str, Learns | str] = {
     "--env=bandit --agent=pqn": _SOON,
     "--env=gymnasium:CartPole-v1 --agent=ppo": _GYM,
     "--env=gymnax:Breakout-MinAtar --agent=pqn": "needs gymnax; tests/test_pqn.py has probes",
+    "--env=gymnax:Asterix-MinAtar --env.pictures --agent=pqn": "needs gymnax; tests/test_pqn.py has probes",
     "--env=envpool:Pong-v5 --agent=impala --preset=gpu": _GPU,
     "--env=hidden-bandit --agent=ppo --trials=10 --agent.conditioning=posterior --agent.unroll=10": _BELIEVES,
     "--env=point-mass-vary-goal --env.num-tasks=4 --split=none --agent=sac --trials=2 --seeds=3 "

@@ -204,13 +204,47 @@ def test_brightness_becomes_a_number_around_zero():
 
 
 def test_networks_have_the_sizes_of_their_papers():
-    """DrQ: 35 x 35 x 32 features of 84 x 84 pixels. IMPALA: 11 x 11 x 32."""
-    seen = jax.ShapeDtypeStruct((84, 84, 9), jnp.uint8)
-    size = lambda network: jax.eval_shape(lambda x: network.init_with_output(KEY, x)[0], seen).shape
-    assert {name: size(network()) for name, network in vision.NETWORKS.items()} == {
+    """DrQ: 35 x 35 x 32 features of 84 x 84 pixels. IMPALA: 11 x 11 x 32. PQN: 8 x 8 x 16 of 10 x 10 cells."""
+    size = lambda network, side: features_of(network, jax.ShapeDtypeStruct((side, side, 9), jnp.uint8)).shape
+    sides = {"drq": 84, "impala": 84, "grid": 10}
+    assert {name: size(network, sides[name]) for name, network in vision.NETWORKS.items()} == {
         "drq": (35 * 35 * 32,),
         "impala": (11 * 11 * 32,),
+        "grid": (8 * 8 * 16,),
     }
+
+
+def features_of(name, seen):
+    """Shapes of what a network makes of pictures."""
+    return jax.eval_shape(lambda x: name().init_with_output(KEY, x)[0], seen)
+
+
+@pytest.mark.parametrize("name", vision.NETWORKS)
+def test_the_smallest_pictures_have_features(name):
+    """And smaller ones are refused, as an encoder would see nothing; so is a vector without layers."""
+    side, encoded = vision.LEAST[name], Encoded(vision=name)
+    seen = lambda side: {"pixels": jax.ShapeDtypeStruct((side, side + 1, 3), jnp.uint8)}
+    assert features_of(vision.NETWORKS[name], seen(side)["pixels"]).size > 0
+    encoded.require(seen(side))
+    with pytest.raises(
+        InputError, match=rf"vision={name} takes pictures of at least {side} x {side}, not \({side - 1}"
+    ):
+        encoded.require(seen(side - 1))
+    Encoded(latent_widths=()).require(seen(15))
+    with pytest.raises(InputError, match="latent-widths needs at least one layer"):
+        Encoded(latent_widths=()).require(jnp.zeros(5))
+
+
+def test_a_convolution_of_cells_is_normalised_over_its_filters():
+    """By hand: filter k counts the middle cell k times, so that 16 numbers from 0 to 15 have variance 21.25."""
+    network, seen = vision.NETWORKS["grid"](), np.zeros((3, 3, 2), np.uint8)
+    params = network.init(KEY, seen)["params"]
+    assert params["Conv_0"]["kernel"].shape == (3, 3, 2, 16)
+    params["Conv_0"]["kernel"] = jnp.zeros((3, 3, 2, 16)).at[1, 1, 0].set(jnp.arange(16.0))
+    np.testing.assert_array_equal(network.apply({"params": params}, seen), np.zeros(16))
+    seen[1, 1] = 255
+    expected = np.maximum((np.arange(16) - 7.5) / np.sqrt(21.25), 0)
+    np.testing.assert_allclose(network.apply({"params": params}, seen), expected, atol=1e-5)
 
 
 def test_residual_blocks_that_give_nothing_pass_on_what_they_got():
@@ -233,6 +267,8 @@ def test_a_projection_is_bounded_and_leaves_the_state_beside_it():
     np.testing.assert_array_equal(latent[:, 4:], obs["state"])
     scaled = projection.apply(params, obs | {"pixels": 100 * obs["pixels"]})
     np.testing.assert_allclose(scaled, latent, atol=1e-3)
+    as_they_are = vision.Projection()
+    np.testing.assert_array_equal(as_they_are.apply({}, obs), np.concatenate([obs["pixels"], obs["state"]], axis=1))
 
 
 @pytest.mark.parametrize("name", vision.NETWORKS)

@@ -1,24 +1,23 @@
 """PQN: its targets by hand, exploration that falls, masks, and tabular processes against value iteration."""
 
-import dataclasses
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import learn, only_seed, pick, quick, slow_but, tasks_of, tiny, train
+from probes import learn, only_seed, pick, quick, random_batch, slow_but, tasks_of, tiny, train
 from test_ppo import random_steps
 
 import mtjax
-from mtjax import agents
+from mtjax import agents, frames
 from mtjax.agents import for_action
 from mtjax.agents.networks import Params
 from mtjax.agents.swept import sweepable
 from mtjax.agents.unseen_tasks import describe_unseen
 from mtjax.command import run_config
 from mtjax.config import with_preset
-from mtjax.envs.probes import Probe
+from mtjax.envs.probes import Pictured, Probe
 from mtjax.saved.config_json import from_json, to_json
 from mtjax.types import Discrete, InputError, Spec
 
@@ -157,7 +156,10 @@ def test_greedy_actions_are_those_of_value_iteration():
         ({"q_lambda": 1.5}, "q-lambda"),
         ({"epsilon": -0.1}, "epsilon"),
         ({"epsilon_rollouts": 0}, "epsilon-rollouts must be at least 1"),
-        ({"representation": "deepmdp"}, "use representation=plain"),
+        ({"representation": "deepmdp"}, "use representation=plain or encoded"),
+        ({"representation": "autoencoder"}, "use representation=plain or encoded"),
+        ({"representation": "asymmetric"}, "use representation=plain or encoded"),
+        ({"representation": "encoded", "shift": 2}, "shift=2 is of updates from a replay, and pqn has none"),
         ({"scaling": "popart", "heads": "per-task"}, "no scaling=popart"),
         ({"sampler": "hardest"}, "sampler=uniform"),
     ],
@@ -203,9 +205,8 @@ def test_continuous_actions_are_refused():
         mtjax.train("finger-spin", "pqn", steps=100, quiet=True)
 
 
-@dataclasses.dataclass(frozen=True)
-class Choices(Probe):
-    """Probes in which one of five actions stands for -1, -1/2, 0, 1/2 or 1."""
+class Five:
+    """Makes one of five actions stand for -1, -1/2, 0, 1/2 or 1."""
 
     @property
     def spec(self):
@@ -213,6 +214,14 @@ class Choices(Probe):
 
     def step(self, task, state, action):
         return super().step(task, state, (action - 2)[None] / 2)
+
+
+class Choices(Five, Probe):
+    """Probes of choices."""
+
+
+class SeenChoices(Five, Pictured):
+    """Probes of choices whose observations are seen."""
 
 
 GAMMA, SCALES = 0.9, (1.0, -0.5)
@@ -241,3 +250,74 @@ def test_probes_are_learned(kind):
         if kind == "by-action":
             np.testing.assert_allclose((found.argmax(axis=-1) - 2) / 2, [scale], atol=0.01)
     assert history[0]["bad_step"].max() == -1
+
+
+SEEING = {"representation": "encoded", "vision": "grid", "latent_widths": ()}
+CELLS = SPEC._replace(obs={"pixels": jax.ShapeDtypeStruct((5, 6, 2), jnp.uint8)})
+
+
+def seen_steps(agent):
+    """Rollouts (T, H, E, ...) of random pictures."""
+    steps, pictures = steps_of(agent), random_batch(0, 3, 8, CELLS)
+    as_steps = lambda obs: {"pixels": obs["pixels"].reshape(*steps.reward.shape, 5, 6, 2)}
+    return steps._replace(obs=as_steps(pictures.obs), next_obs=as_steps(pictures.next_obs))
+
+
+def by_hand(state, obs):
+    """The values (..., A) of pictures, of the paper's layers by plain sums."""
+    encoder, critic = state.nets["representation"].shared, state.nets["critic"].shared
+    cells, dense, head = encoder["latent"]["params"]["Cells_0"], critic["body"]["params"]["MLP_0"], critic["head"]
+    normed = lambda x: (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+    x, kernel = np.asarray(obs["pixels"], float) / 255, np.asarray(cells["Conv_0"]["kernel"], float)
+    place = lambda i, j: np.tensordot(x[..., i : i + 3, j : j + 3, :], kernel, 3)
+    found = np.stack([np.stack([place(i, j) for j in range(4)], -2) for i in range(3)], -3)
+    flat = np.maximum(normed(found), 0).reshape(*found.shape[:-3], -1)
+    hidden = np.maximum(normed(flat @ np.asarray(dense["Dense_0"]["kernel"])), 0)
+    return hidden @ np.asarray(head["kernel"]) + np.asarray(head["bias"])
+
+
+def test_values_of_pictures_are_those_of_the_papers_network():
+    """In acting and in targets, both by the present encoder; no projection and no slow copy stands between."""
+    # Eight steps, in parts of three, which overlap.
+    agent = small(q_lambda=0.0, gamma=0.9, minibatches=3, conditioning="none", **SEEING)
+    state, steps = agent.init(CELLS, TASKS, KEY), seen_steps(agent)
+    task, one = pick(TASKS, 1), jax.tree.map(lambda x: x[1, 2, 0], steps.obs)
+    assert not state.slow and not jax.tree.leaves(state.nets["representation"].shared["projection"])
+    acted = agent.act(state, agent.begin(state, task), one, task, None)
+    np.testing.assert_allclose(acted.outputs, by_hand(state, one), atol=1e-4)
+    found = agent.assess(state, steps, TASKS)[1].extras
+    ahead = by_hand(state, jax.tree.map(np.asarray, steps.next_obs)).max(axis=-1)
+    np.testing.assert_allclose(found, steps.reward + 0.9 * steps.discount * ahead, atol=1e-4)
+
+
+def test_the_loss_of_values_trains_the_convolution():
+    """An update moves each of its arrays, and the values that the next step acts by."""
+    agent = small(**SEEING)
+    state, steps = agent.init(CELLS, TASKS, KEY), seen_steps(agent)
+    after, metrics = jax.jit(lambda state: learn(agent, state, steps, TASKS, KEY))(state)
+    for name in ("representation", "critic"):
+        moved = jax.tree.map(lambda x, y: bool(np.any(x != y)), after.nets[name].shared, state.nets[name].shared)
+        assert all(jax.tree.leaves(moved)), (name, moved)
+    assert np.all(np.isfinite(metrics["critic_loss"]))
+    mixed = state.with_nets(representation=after.nets["representation"])
+    task, obs = pick(TASKS, 0), jax.tree.map(lambda x: x[0, 0, 0], steps.obs)
+    outputs = lambda state: np.asarray(agent.act(state, agent.begin(state, task), obs, task, None).outputs)
+    assert np.abs(outputs(mixed) - outputs(state)).max() > 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vision", ["grid", "drq"])
+def test_what_only_pictures_show_is_learned(vision):
+    """The best of five actions, a task's scale times a sign that the picture shows; and that it is worth 0."""
+    seeing = SEEING if vision == "grid" else {"representation": "encoded", "latent_widths": (16,)}
+    given = {"num_envs": 16, "chunk_steps": 1600, "unroll": 8, "epochs": 4, "minibatches": 4, "gamma": GAMMA}
+    given |= {"epsilon": 0.3, "epsilon_rollouts": 40, "q_lambda": 0.0, "critic_lr": 3e-3}
+    env, tasks = SeenChoices("by-both"), tasks_of("by-both", SCALES)
+    agent = for_action(tiny("pqn", hidden=(32,), **seeing), Discrete(5))
+    state = only_seed(train(env, agent, given, tasks=tasks)[0].agent)
+    for i, scale in enumerate(SCALES):
+        for sign in (-1.0, 1.0):
+            step = env.show(env.reset(pick(tasks, i), KEY)._replace(obs=jnp.float32([sign])))
+            task, obs = pick(tasks, i), frames.begin(step.obs, env.frames)
+            values = np.asarray(agent.act(state, agent.begin(state, task), obs, task, None).outputs)
+            assert (values.argmax() - 2) / 2 == scale * sign and values.max() == pytest.approx(0, abs=0.15)

@@ -180,6 +180,15 @@ def check_replayed(agent: Any) -> None:
         )
 
 
+def refuse_of_replay(agent: Any) -> None:
+    """Refuse settings of a representation that only learning from a replay has."""
+    given, usual = (parts.settings(x) for x in (agent.representation, type(agent.representation)()))
+    for name in ("encoder_tau", "shift"):
+        if given.get(name) != usual.get(name):
+            flag, kind = name.replace("_", "-"), type(agent).__name__.lower()
+            raise InputError(f"{flag}={given[name]} is of updates from a replay, and {kind} has none; leave it out")
+
+
 def _check_continual(agent: Any) -> None:
     """Refuse what would change the actor of earlier tasks beside its gradient steps, or leaves nothing to hold."""
     name = _name(agent, "continual")

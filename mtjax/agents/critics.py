@@ -109,7 +109,12 @@ def values(agent: Any, state: AgentState, features: Array, obs: Any) -> Array:
 
 def outputs(agent: Any, state: AgentState, features: Array, obs: Any) -> Array:
     """Return the critic's outputs (T, B) for observations (T, B, ...)."""
-    of_tasks = partial(over_tasks, agent.output, state.nets)
+    return over_rollout(agent.output, agent, state, features, obs)
+
+
+def over_rollout(function: Any, agent: Any, state: AgentState, features: Array, obs: Any) -> Array:
+    """Map a function of one task's networks over the observations (T, B, ...) of a rollout; pictures in parts of B."""
+    of_tasks = partial(over_tasks, function, state.nets)
     if frames.shown(obs):  # all at once they would fill the memory
         return in_parts(of_tasks, features, obs, agent.experience.minibatches)
     return of_tasks(features, obs)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import critics, parts, unit_resets
+from mtjax.agents import combinations, critics, parts, unit_resets
 from mtjax.agents.base import BaseAgent, Inputs, Memory
 from mtjax.agents.fit import Fit, Losses, above_least, descend
 from mtjax.agents.hyperparameters import FLAT
@@ -137,13 +137,7 @@ class OnPolicy(BaseAgent):
             raise InputError("scaling=popart is for critics of actions; use value-normalization=popart")
         if self.sampler.by_temperature:
             raise InputError("sampler=temperature needs an agent with temperatures; use another sampler")
-        given, usual = (parts.settings(x) for x in (self.representation, type(self.representation)()))
-        for name in ("encoder_tau", "shift"):
-            if given.get(name) != usual.get(name):
-                flag, agent = name.replace("_", "-"), type(self).__name__.lower()
-                raise InputError(
-                    f"{flag}={given[name]} is of updates from a replay, and {agent} has none; leave it out"
-                )
+        combinations.refuse_of_replay(self)
 
     losses = losses_of
 

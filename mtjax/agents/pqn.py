@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents import parts
+from mtjax.agents import combinations, critics, parts
 from mtjax.agents.base import BaseAgent, HeadsOfOne, Inputs, Memory
 from mtjax.agents.fit import Fit, Losses, descend
 from mtjax.agents.hyperparameters import FLAT
@@ -15,9 +15,10 @@ from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts import targets
 from mtjax.agents.parts.policies import Categorical, Policy
 from mtjax.agents.parts.policies.categorical import allowed
+from mtjax.agents.parts.representations import Asymmetric
 from mtjax.agents.parts.samplers import Uniform
 from mtjax.agents.rates import discounts_of_all
-from mtjax.agents.state import AgentState, Nets, over_tasks
+from mtjax.agents.state import AgentState, Nets
 from mtjax.experience import Rollouts
 from mtjax.experience.rollouts import played, windows
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
@@ -48,7 +49,12 @@ class PQN(BaseAgent):
     With exploration G is biased, as it follows actions that the greedy policy would not take (Peng and Williams 1996).
     ``cut_exploration`` cuts the sum before such an action, without bias (Watkins 1989).
 
-    Differs from the authors' code: Adam replaces RAdam, at a constant rate by default.
+    Of pictures, ``representation=encoded`` gives Q an encoder that the same loss trains. The authors' network for
+    MinAtar's games has ``vision=grid``, no ``latent_widths`` and ``hidden`` of 128: a convolution and a layer, each
+    with layer normalisation and ReLU. Presets choose it where these games are seen (``--env.pictures``).
+
+    Differs from the authors' code: Adam replaces RAdam, at a constant rate by default. Weights begin by LeCun's
+    initialisation, there by He's. Cells of MinAtar's games are 0 or 1, there 0 or 1/255.
     """
 
     adjustable: ClassVar[tuple[str, ...]] = (
@@ -82,8 +88,9 @@ class PQN(BaseAgent):
         super().__post_init__()
         parts.require_shares(self, "q_lambda", "epsilon")
         parts.require_counts(self, "epsilon_rollouts")
-        if self.representation.learns:
-            raise InputError("pqn learns values of observations as they are; use representation=plain")
+        if self.representation.models or isinstance(self.representation, Asymmetric):
+            raise InputError("pqn learns from the loss of its values alone; use representation=plain or encoded")
+        combinations.refuse_of_replay(self)
         if self.scaling.rescales or type(self.sampler) is not Uniform:
             raise InputError("pqn keeps its heads, and learns all tasks alike: no scaling=popart, and sampler=uniform")
 
@@ -141,7 +148,7 @@ class PQN(BaseAgent):
 
     def values(self, state: AgentState, features: Array, obs: Any, tasks: Task) -> Array:
         """Return the values (T, B, A) of all actions; those that a task does not have are worth nothing at all."""
-        found = over_tasks(self.q, state.nets, features, obs)
+        found = critics.over_rollout(self.q, self, state, features, obs)
         return allowed(found, None if tasks.action_mask is None else tasks.action_mask[:, None])
 
     def update(

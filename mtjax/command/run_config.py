@@ -14,7 +14,7 @@ from mtjax.command.imports import import_files, imports_of
 from mtjax.command.parsing import parse_with_tyro
 from mtjax.command.refusals import check_names, unknown_flag
 from mtjax.config import NO_FINE_TUNING, RunConfig, describe_teacher, fit_length, own_files, with_preset
-from mtjax.envs import is_mixture, make, require_pictures
+from mtjax.envs import ENVS, is_mixture, make, require_pictures
 from mtjax.envs.family import Family
 from mtjax.envs.mixtures import Mixture, require_family
 from mtjax.names import InputError
@@ -61,6 +61,8 @@ def draft(argv: Sequence[str]) -> RunConfig:
             of_family[name] = int(value)
     if is_mixture(env_name):
         of_family, argv = _peel_shared(argv, make(env_name))
+    elif "--env.pictures" in argv and hasattr(ENVS[env_name][0], "pictures"):
+        of_family["pictures"] = True
     given = {name.replace("-", "_"): flag_value(argv, f"agent.{name}", "") for name in _DECIDING}
     deciding: dict[str, Any] = {name: value for name, value in given.items() if value}
     if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse

@@ -56,7 +56,7 @@ def over_learners(function: Callable) -> Callable:
 def in_parts(function: Callable, features: Array, obs: Any, parts: int) -> Array:
     """Apply a function of features and observations (T, B, ...) to ``parts`` of B, one after another.
 
-    The result (T, B) is as of one call; less memory is in use at once.
+    The result (T, B, ...) is as of one call; less memory is in use at once.
 
     Args:
         features: (T, Z), or (T, B, Z) where each step has its own.
@@ -69,10 +69,10 @@ def in_parts(function: Callable, features: Array, obs: Any, parts: int) -> Array
         take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, size, axis=1)
         return function(take(features) if features.ndim == 3 else features, jax.tree.map(take, obs))
 
-    found = jax.lax.map(one, starts)  # (parts, T, size)
+    found = jax.lax.map(one, starts)  # (parts, T, size, ...)
     place = jnp.arange(count)
     part = place // size
-    return found[part, :, place - starts[part]].T
+    return jnp.swapaxes(found[part, :, place - starts[part]], 0, 1)
 
 
 def when(due: Array, function: Callable, state: Any) -> tuple[Any, Any]:

@@ -1,6 +1,7 @@
 """Vision: networks that encode stacks of pictures, networks that draw them, and random shifts.
 
-Pictures are uint8, (..., H, W, K) for K channels of all stacked pictures. Networks see values in [-0.5, 0.5].
+Pictures are uint8, (..., H, W, K) for K channels of all stacked pictures. Networks see values in [-0.5, 0.5], of grids
+in [0, 1].
 """
 
 from functools import partial
@@ -15,9 +16,10 @@ from mtjax.agents.networks import orthogonal
 from mtjax.agents.parts.convolution import Transposed, convolve
 from mtjax.types import Array, Key, Transition
 
-Vision = Literal["drq", "impala"]
+Vision = Literal["drq", "impala", "grid"]
 _FILTERS = 32
 _SECTIONS = (16, 32, 32)  # IMPALA's channels
+_OF_CELLS = 16  # filters for grids
 _Conv = partial(nn.Conv, conv_general_dilated=convolve)
 _ORTHOGONAL = orthogonal(2**0.5)
 
@@ -56,7 +58,22 @@ class Residual(nn.Module):
         return nn.relu(x).reshape(*lead, -1)
 
 
-NETWORKS: dict[str, type[nn.Module]] = {"drq": Convolutions, "impala": Residual}
+class Cells(nn.Module):
+    """A convolution of 3 x 3 with 16 filters, and layer normalisation, for grids of few cells (Gallici et al. 2025).
+
+    Normalisation is over the filters of each place. Cells have values in [0, 1], so that nothing is 0.
+    """
+
+    @nn.compact
+    def __call__(self, pictures: Array) -> Array:
+        """Map pictures (..., H, W, K) to features (..., F)."""
+        x = _Conv(_OF_CELLS, (3, 3), padding="VALID")(pictures.astype(jnp.float32) / 255)
+        return nn.relu(nn.LayerNorm()(x)).reshape(*x.shape[:-3], -1)
+
+
+NETWORKS: dict[str, type[nn.Module]] = {"drq": Convolutions, "impala": Residual, "grid": Cells}
+LEAST: dict[str, int] = {"drq": 15, "impala": 1, "grid": 3}
+"""Height and width of the smallest pictures that each network takes."""
 
 
 def project(features: Array, size: int) -> Array:
@@ -65,14 +82,18 @@ def project(features: Array, size: int) -> Array:
 
 
 class Projection(nn.Module):
-    """Maps features of pictures to latent states (..., D), to which a state that is seen beside them is appended."""
+    """Maps features of pictures to latent states (..., D), to which a state that is seen beside them is appended.
 
-    size: int
+    Without a size, latent states are the features.
+    """
+
+    size: int | None = None
 
     @nn.compact
     def __call__(self, obs: Any) -> Array:
         """Map an observation with features (..., F) in place of pictures."""
-        latent, state = project(obs[frames.PICTURES], self.size), frames.state(obs)
+        features, state = obs[frames.PICTURES], frames.state(obs)
+        latent = features if self.size is None else project(features, self.size)
         return latent if state is None else jnp.concatenate([latent, state], axis=-1)
 
 

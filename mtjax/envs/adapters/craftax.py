@@ -4,10 +4,8 @@ import dataclasses
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 
-from mtjax.envs.adapters.family import Adapted
-from mtjax.frames import PICTURES
+from mtjax.envs.adapters.family import Adapted, as_picture
 from mtjax.names import nearest_error
 from mtjax.types import Array, Discrete, InputError, Key, Task
 
@@ -75,4 +73,4 @@ class Craftax(Adapted):
 
 def _seen(obs: Array) -> Any:
     """Return a vector as it is, and a picture, whose numbers are from 0 to 1, as bytes."""
-    return {PICTURES: jnp.uint8(jnp.round(255 * obs))} if obs.ndim == 3 else obs
+    return as_picture(obs) if obs.ndim == 3 else obs

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from mtjax.envs.choosing import Acting
 from mtjax.envs.family import Family
 from mtjax.envs.parameters import REWARD_SCALE, Parameter
-from mtjax.frames import shown
+from mtjax.frames import PICTURES, shown
 from mtjax.types import Array, InputError, Key, Step, Task
 
 _MOST_STEPS = 1_000_000
@@ -141,6 +141,11 @@ class Adapted(Acting, Family):
     def instruction(self) -> str:
         """Return what all tasks ask for."""
         return f"Earn the rewards of {self.environment}."
+
+
+def as_picture(obs: Array) -> dict[str, Array]:
+    """Return an array (H, W, C) of numbers from 0 to 1 as a picture, in which 1 is 255."""
+    return {PICTURES: jnp.uint8(jnp.round(255 * obs))}
 
 
 def _as_default(default: Any, value: Array) -> Array:

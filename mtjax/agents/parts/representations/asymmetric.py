@@ -33,7 +33,8 @@ class Asymmetric(Plain):
     latent_widths: tuple[int, ...] = (256, 50)
     """Widths of the encoder's layers; the last is the size of the latent state. Of pictures only the last counts."""
     vision: Vision = "drq"
-    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ) or impala (fifteen in residual blocks)."""
+    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ), impala (fifteen in residual blocks) or grid (one,
+    for grids of few cells)."""
     shift: int = 4
     """Shift pictures of a batch from the replay by up to so many pixels at random; 0 for none."""
 

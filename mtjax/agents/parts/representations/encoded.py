@@ -13,8 +13,8 @@ from mtjax.agents import parts
 from mtjax.agents.networks import MLP, OVER_TASKS, Network, Params
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.base import Plain
-from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project, shift_pictures
-from mtjax.types import Array, Key, Transition
+from mtjax.agents.parts.vision import LEAST, NETWORKS, Projection, Vision, project, shift_pictures
+from mtjax.types import Array, InputError, Key, Transition
 
 ENCODERS = ("latent",)
 PROJECTION = "projection"
@@ -34,6 +34,21 @@ class Latent(nn.Module):
         return project(MLP(tuple(inner))(obs), size)
 
 
+def require_visible(encoded: "Encoded", obs: Any) -> None:
+    """Check that an encoder can take observations of these shapes.
+
+    Raises:
+        InputError: it has no layers for vectors, or pictures are smaller than its convolutions.
+    """
+    if not frames.shown(obs):
+        parts.require_layers(encoded, "latent_widths")
+        return
+    picture, least = obs[frames.PICTURES].shape, LEAST[encoded.vision]
+    if min(picture[:2]) < least:
+        told = f"vision={encoded.vision} takes pictures of at least {least} x {least}, not {picture}"
+        raise InputError(f"{told}; for grids of few cells use --agent.vision=grid")
+
+
 @dataclasses.dataclass(frozen=True)
 class Encoded(Plain):
     """Encoded is an encoder phi that all critics train and share with the actor, above all for pictures.
@@ -43,7 +58,8 @@ class Encoded(Plain):
     linear layer, layer normalisation and tanh. The critics' loss trains f and the critics' projection. The actor has a
     projection of its own on sg(f(s)), which its loss trains. A state that is observed beside pictures is appended to
     the latent state. Target critics see phibar(s), the target encoder. It moves by ``encoder_tau``; of pictures this is
-    f alone, and the projection's target copy moves by ``tau``, as those of the critics' other layers do.
+    f alone, and the projection's target copy moves by ``tau``, as those of the critics' other layers do. Without
+    ``latent_widths`` there is no projection: actor and critics see f(s) itself.
 
     In every update from the replay each picture of the batch is shifted at random by up to ``shift`` pixels, those of s
     and of s' on their own (Yarats, Kostrikov and Fergus 2021, DrQ; Yarats et al. 2022, DrQ-v2). PPO shifts none.
@@ -56,9 +72,11 @@ class Encoded(Plain):
     """
 
     latent_widths: tuple[int, ...] = (256, 50)
-    """Widths of the encoder's layers; the last is the size of the latent state. Of pictures only the last counts."""
+    """Widths of the encoder's layers; the last is the size of the latent state. Of pictures only the last counts, and
+    without any there is no projection."""
     vision: Vision = "drq"
-    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ) or impala (fifteen in residual blocks)."""
+    """Convolutions for pictures: drq (four, as in SAC-AE and DrQ), impala (fifteen in residual blocks) or grid (one,
+    for grids of few cells)."""
     shift: int = 4
     """Shift pictures of a batch from the replay by up to so many pixels at random; 0 for none."""
     encoder_tau: float = 0.05
@@ -71,7 +89,7 @@ class Encoded(Plain):
 
     def __post_init__(self):
         super().__post_init__()
-        parts.require_layers(self, "latent_widths")
+        (parts.require_layers if self.models else parts.require_widths)(self, "latent_widths")
         parts.require_not_negative(self, "shift")
         parts.require_rates(self, "encoder_tau")
 
@@ -83,6 +101,8 @@ class Encoded(Plain):
     def own_target(self) -> tuple[str, ...]:  # type: ignore[override]
         swept = isinstance(self.encoder_tau, jax.Array)
         return self.slow if not swept and self.encoder_tau == 1 else ()
+
+    require = require_visible  # type: ignore[override]
 
     def augment(self, batch: Transition, key: Key) -> Transition:
         return shift_pictures(batch, key, self.shift)
@@ -101,7 +121,7 @@ class Encoded(Plain):
     @property
     def sight(self) -> nn.Module:  # type: ignore[override]
         """Return a projection, which critics and actor each have of their own."""
-        return Projection(self.latent_widths[-1])
+        return Projection(*self.latent_widths[-1:])
 
     def apply(self, params: Params, name: str, *inputs: Any) -> Array:
         """Map one task's inputs by an encoder or a model."""
@@ -112,7 +132,7 @@ class Encoded(Plain):
     ) -> tuple[Params, Key]:
         key, vector_key, *keys = jax.random.split(key, 2 + len(self.modules))
         params = self.init_vectors(num_tasks, vector_key)
-        latent = jnp.zeros(self.latent_widths[-1])  # models see no state beside pictures
+        latent = jnp.zeros(self.latent_widths[-1:])  # models see no state beside pictures
         features = self.task_features(params.of_first(), features)
         inputs = {"latent": (obs,), **self.model_inputs(latent, features, action)}
         for (name, module), part_key in zip(self.modules.items(), keys, strict=True):
