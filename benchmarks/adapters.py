@@ -1,6 +1,6 @@
 """Compare environment steps a second of our loop with those of other packages' own scans, with as many worlds.
 
-    python benchmarks/adapters.py [--names NAME ...] [--repeats N] [--json FILE]
+    python benchmarks/adapters.py [--names NAME ...] [--pictures] [--repeats N] [--json FILE]
 
 Ours is a chunk of ``mtjax.train`` for an agent that acts at random and learns nothing: it acts in every world by a key
 of its own, steps, begins ended episodes anew, sums returns, and looks for numbers that are not finite. Theirs is a scan
@@ -92,12 +92,13 @@ class Chance:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--names", nargs="*", default=list(CONTESTS), choices=CONTESTS)
+    parser.add_argument("--pictures", action="store_true", help="ours observes grids as pictures, which are bytes")
     parser.add_argument("--repeats", type=int, default=7, help="rounds")
     parser.add_argument("--json", help="write the figures to this file too")
     arguments = parser.parse_args()
     rows = []
     for name in arguments.names:
-        rows.append(compare(name, arguments.repeats))
+        rows.append(compare(name, arguments.repeats, {"pictures": True} if arguments.pictures else {}))
         line = (
             "{environment}: ours {ours:,.0f}, theirs {theirs:,.0f} steps/s; ratio {ratio:.2f}, of CPU {cpu_ratio:.2f}, "
             "where theirs keeps observations {kept_ratio:.2f}"
@@ -106,9 +107,9 @@ def main() -> None:
     publish(arguments, rows)
 
 
-def compare(name: str, repeats: int) -> dict[str, Any]:
-    """Time our loop and the package's own scans in turn."""
-    contest, family = CONTESTS[name], mtjax.make(name)
+def compare(name: str, repeats: int, given: dict[str, Any]) -> dict[str, Any]:
+    """Time our loop, with settings of the family, and the package's own scans in turn."""
+    contest, family = CONTESTS[name], mtjax.make(name, **given)
     settings = Settings(num_envs=contest.worlds, chunk_steps=contest.steps)
     agent: Any = Chance(family.spec.action, Rollouts(unroll=UNROLL, epochs=1, minibatches=1))
     training = Training(family, agent, settings, most_devices=1)

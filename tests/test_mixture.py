@@ -135,15 +135,18 @@ class Shown(Aim):
 
     side: int = 16
     state: str = "hidden"
+    channels: int = 1
+    frames: int = 2
 
     @property
     def spec(self):
-        picture = jax.ShapeDtypeStruct((self.side, self.side, 1), jnp.uint8)
+        picture = jax.ShapeDtypeStruct((self.side, self.side, self.channels), jnp.uint8)
         beside = {"state": jax.ShapeDtypeStruct((self.obs_size,), jnp.float32)} if self.state == "also" else {}
-        return super().spec._replace(obs={"pixels": picture} | beside, frames=2)
+        return super().spec._replace(obs={"pixels": picture} | beside, frames=self.frames)
 
     def show(self, step):
-        picture = jnp.full((self.side, self.side, 1), jnp.clip(50 * step.obs[0] + 100, 0, 255)).astype(jnp.uint8)
+        size, bright = (self.side, self.side, self.channels), jnp.clip(50 * step.obs[0] + 100, 0, 255)
+        picture = jnp.full(size, bright).astype(jnp.uint8)
         return step._replace(obs={"pixels": picture} | ({"state": step.obs} if self.state == "also" else {}))
 
     def reset(self, task, key):
@@ -774,6 +777,21 @@ def test_families_with_pictures_of_one_shape_mix():
             np.testing.assert_array_equal(ours["pixels"][:, place], alone["pixels"])
             np.testing.assert_array_equal(ours["state"][:, place][..., : family.obs_size], alone["state"])
             assert not np.any(ours["state"][:, place][..., family.obs_size :])
+
+
+def test_channels_of_single_pictures_are_padded():
+    """With zeros at the end, when worlds begin and step, alone too; of stacks they must be as many."""
+    few, many = Shown(vary={"goal": "-1,1"}, split="none", frames=1, channels=2), WideShown(frames=1, channels=3)
+    env = mixture([few, many])
+    assert env.spec.obs["pixels"].shape == (16, 16, 3)
+    tasks, keys = env.tasks(), keys_of(env.tasks())
+    start, seen, _ = steps_of(env, tasks, keys, jnp.ones((1, 1, 3, 2, 1)))
+    alone = env.reset(pick(tasks, 0), keys[0, 0, 0]).obs["pixels"]
+    for first in (start["pixels"][0, 0, 0], seen.obs["pixels"][0, 0, 0, 0], alone):
+        assert first.shape == (16, 16, 3) and np.all(first[..., :2]) and not np.any(first[..., 2])
+    assert np.all(start["pixels"][0, 2])
+    with pytest.raises(InputError, match=r"2 pictures \(16, 16, 2\) and wide-shown 2 pictures \(16, 16, 3\)"):
+        _ = mixture([Shown(channels=2), WideShown(channels=3)]).spec
 
 
 def test_families_that_look_otherwise_do_not_mix():

@@ -99,8 +99,11 @@ def mixed_spec(families: dict[str, Family], sentences: tuple[str, ...]) -> Spec:
     _require_one_kind(specs, any(isinstance(family, Choosing) for family in families.values()))
     found = list(specs.values())
     widest: Any = jax.ShapeDtypeStruct((max(map(frames.state_size, found)),), np.float32)
+    obs = frames.with_state(lambda _: widest, frames.joined(found[0].obs))
+    if frames.shown(obs):
+        obs |= {frames.PICTURES: max((spec.obs[frames.PICTURES] for spec in found), key=lambda x: x.shape[-1])}
     return Spec(
-        obs=frames.with_state(lambda _: widest, frames.joined(found[0].obs)),
+        obs=obs,
         action=max((spec.action for spec in found), key=lambda action: action.size),
         context_size=mixed_contexts(list(families.values())).shape[1],
         mixed=len(families) > 1 and not _need_one_scale(list(families.values())),
@@ -127,11 +130,12 @@ def _require_one_look(specs: dict[str, Spec]) -> None:
 
 
 def _look(spec: Spec) -> str:
-    """Return what an observation shows, as text."""
+    """Return what an observation shows, as text; of single pictures without their channels, which may differ."""
     if not frames.shown(spec.obs):
         return "no pictures"
     beside = "" if frames.state(frames.joined(spec.obs)) is None else " beside a state"
-    return f"{spec.frames} pictures {spec.obs[frames.PICTURES].shape}{beside}"
+    shape = spec.obs[frames.PICTURES].shape
+    return f"{spec.frames} pictures {shape if spec.frames > 1 else shape[:2]}{beside}"
 
 
 def _require_one_kind(specs: dict[str, Spec], scored: bool) -> None:

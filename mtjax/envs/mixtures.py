@@ -32,8 +32,8 @@ class Mixture:
     """An environment with the tasks of several families, from ``mtjax.mixture`` or ``mtjax.make("NAME+NAME")``.
 
     Observation (O,): the family's own, padded with zeros to that of the widest family. One of several arrays is joined
-        to a vector before. Pictures are not padded: either
-        no family shows any, or all show pictures of one shape, with or without a state (O,) beside them.
+        to a vector before. Either no family shows pictures, or all show pictures of one shape, with or without a state
+        (O,) beside them. If they show one at a time, their channels may differ, and are padded with zeros too.
     Action: as many entries, or choices, as the widest family has. A task's ``action_mask`` (A,) says which of them are
         its own. Either all families have continuous actions, or all have discrete ones, or all have several discrete
         ones at once, of the same sizes.
@@ -244,11 +244,17 @@ def _padded(mixture: Mixture, i: int, step: Step, metrics: list[str], cut_off: b
 
 
 def _seen(mixture: Mixture, family: Family, step: Step) -> Step:
-    """Return a step with the vector (..., O') that networks take of it, padded with zeros to the mixture's."""
+    """Return a step with what networks take of it: vectors (..., O') and channels, padded with zeros to a mixture's."""
     join, obs = frames.layout(family.spec.obs), step.obs
-    size = frames.state_size(mixture.spec)
-    wide = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]) if x.shape[-1] < size else x
-    return step._replace(obs=frames.with_state(wide, obs if join is None else join(obs)))
+    obs = frames.with_state(partial(_wide, frames.state_size(mixture.spec)), obs if join is None else join(obs))
+    if frames.shown(obs):
+        obs |= {frames.PICTURES: _wide(mixture.spec.obs[frames.PICTURES].shape[-1], obs[frames.PICTURES])}
+    return step._replace(obs=obs)
+
+
+def _wide(size: int, x: Array) -> Array:
+    """Return an array (..., N) with zeros at the end of its last axis, up to ``size``."""
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, size - x.shape[-1])]) if x.shape[-1] < size else x
 
 
 def _member(mixture: Mixture, task: Task) -> tuple[Family, Task]:
