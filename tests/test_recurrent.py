@@ -12,7 +12,7 @@ from probes import Walk, of_task, pick, quick, slow_but, tasks_of, tiny, train
 
 import mtjax
 from mtjax import agents
-from mtjax.agents import replay_batches
+from mtjax.agents import on_policy, replay_batches
 from mtjax.agents.base import Memory
 from mtjax.agents.parts.knowing.recurrent import Following, Recurrent, Track
 from mtjax.agents.parts.policies import Taken
@@ -87,15 +87,19 @@ def test_the_policy_that_learns_is_the_one_that_played():
 
 
 @pytest.mark.slow
-def test_the_actors_loss_trains_the_memory_in_ppo_and_the_critics_in_sac():
-    """Through all steps of a window."""
+def test_both_losses_train_the_memory_in_the_actors_step_in_ppo_and_the_critics_in_sac():
+    """Through all steps of a window; half the critic's counts."""
     agent = tiny("ppo", unroll=LENGTH, epochs=1, minibatches=1, **RECURRENT)
     state, steps = agent.init(SPEC, TASKS, KEY), rollout()
     state, steps = agent.assess(state, steps, TASKS)
     state, batch = agent.prepare(state, rollouts.windows(steps, agent.unroll), TASKS)
     nets, one = of_task(state.nets, 0), pick(batch._replace(mask=None), 0)
-    slope = jax.grad(lambda nets: agent.actor_loss(nets, one, KEY)[0])(nets)["knowing"]
-    assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(slope))
+    slope = lambda loss: jax.jit(jax.grad(lambda nets: loss(nets)[0]))(nets)["knowing"]
+    actors, critics = slope(lambda nets: agent.actor_loss(nets, one, KEY)), slope(lambda x: agent.critic_loss(x, one))
+    both = slope(lambda nets: on_policy.actors_loss(agent, nets, one, KEY))
+    for found, *of_one in zip(*map(jax.tree.leaves, (both, actors, critics)), strict=True):
+        assert all(np.any(np.asarray(x) != 0) for x in of_one)
+        np.testing.assert_allclose(found, of_one[0] + 0.5 * of_one[1], rtol=1e-4, atol=1e-6)
     teachers = lambda name: {fit for fit, made in tiny(name, **RECURRENT).fits.items() if "knowing" in made.names}
     assert teachers("ppo") == {"actor"} and teachers("sac") == {"critic"}
 

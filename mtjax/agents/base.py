@@ -71,7 +71,8 @@ class BaseAgent(abc.ABC):
     The networks of every agent, by name:
         actor, critic: what learns, beside the nets of a subclass.
         representation: of observations. The critics' loss trains it.
-        knowing: of the task. The critics' loss trains it, or that of an actor that learns from rollouts.
+        knowing: of the task. The critics' loss trains it; where an actor learns from rollouts, both losses do, in its
+            step.
         belief: ``knowing`` as such an actor sees it, if other losses train it: that from before the updates of a
             rollout, so that the policy moves by its own loss alone.
         tasks: what is known of the training tasks: their contexts (N, C), and given vectors (N, V), if any.

@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -21,6 +22,8 @@ from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 LOG_RATIO_LIMIT = 20.0
 """Bound of |log ratio| of two policies, so that its exponential stays finite."""
+CRITICS_WEIGHT = 0.5
+"""Weight of the critic's loss beside the actor's, for what both teach."""
 HEAD_SCALE = 0.01
 """Factor of the output layers' initial weights: all policies begin nearly equal, and values near zero."""
 
@@ -60,9 +63,17 @@ def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, ke
     def critic_loss(nets: Nets, batch: Batch, error: Array) -> tuple[Array, Metrics]:
         return agent.critic_loss(nets, batch)[0], {"td_error": error}
 
-    critic = above_least(agent, critic_loss), (with_models(agent, state, batch, key), error)
-    actor = agent.actor_loss, (batch, jax.random.split(key, state.num_tasks))
-    return Losses(state.nets, {"critic": critic, "actor": actor}, batch)
+    batch = with_models(agent, state, batch, key)
+    actor = partial(actors_loss, agent), (batch, jax.random.split(key, state.num_tasks))
+    return Losses(state.nets, {"critic": (above_least(agent, critic_loss), (batch, error)), "actor": actor}, batch)
+
+
+def actors_loss(agent: Any, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+    """Return the loss of one task in the actor's step, where ``knowing`` may learn from the critic's loss too."""
+    loss, aux = agent.actor_loss(nets, batch, key)
+    if not (agent.conditioning.by_actor and nets["knowing"].parts):
+        return loss, aux
+    return loss + CRITICS_WEIGHT * agent.critic_loss(nets, batch)[0], aux
 
 
 def with_models(agent: Any, state: AgentState, batch: Batch, key: Key) -> Batch:
@@ -170,7 +181,7 @@ class OnPolicy(BaseAgent):
         found = super().fits
         if not self.conditioning.by_actor:
             return found
-        # Critics' steps on what the policy sees would move it as far as its own do, and beyond its ratio's bounds.
+        # A step of the critic's optimiser on what the policy sees would move it as far as its own step does.
         names = {"actor": ("actor", "knowing"), "critic": ("critic", "representation")}
         return {name: dataclasses.replace(fit, names=names[name]) for name, fit in found.items()}
 
@@ -221,12 +232,12 @@ class OnPolicy(BaseAgent):
         sample_key, actor_order, critic_order = jax.random.split(key, 3)
         state, batch = self.prepare(state, window, tasks)
         importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(len(tasks.id)))
+        batch = self.view.keyed(with_models(self, state, batch, key), jax.random.fold_in(key, 4))
         # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
-        data = (batch, jax.random.split(sample_key, len(tasks.id)))
-        moved, actor = descend(self.fits, "actor", state, self.actor_loss, data, actor_order, importance)
+        data, loss = (batch, jax.random.split(sample_key, len(tasks.id))), partial(actors_loss, self)
+        moved, actor = descend(self.fits, "actor", state, loss, data, actor_order, importance)
         state = self.accept(moved, state, actor.aux.kl)
         loss = above_least(self, self.critic_loss)
-        batch = self.view.keyed(with_models(self, state, batch, key), jax.random.fold_in(key, 4))
         state, critic = descend(self.fits, "critic", state, loss, (batch,), critic_order, importance)
         state = unit_resets.renew(self, state, batch, jax.random.fold_in(key, 5), number)
         metrics = critic.aux | critic.metrics | actor.aux.metrics | actor.metrics

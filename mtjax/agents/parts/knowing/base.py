@@ -14,8 +14,9 @@ class Nothing:
     """Shows networks nothing of their task.
 
     Every way of knowing a task is a class with these methods. What it learns is a network of the agent's, ``knowing``,
-    which the critics' loss trains. In agents that learn an actor from rollouts its loss trains it instead, so that the
-    policy moves by its own loss alone; but not what has a loss of its own (``join``).
+    which the critics' loss trains. Agents that learn an actor from rollouts train it in the actor's step instead, by
+    the actor's loss and a share of the critic's, so that nothing else moves the policy; but not what has a loss of its
+    own (``join``).
     """
 
     borrowed: ClassVar[tuple[str, ...]] = ()  # names of what an unseen task uses of its nearest training task
@@ -29,7 +30,7 @@ class Nothing:
 
     @property
     def by_actor(self) -> bool:
-        """Whether the actor's loss trains it, in agents that learn an actor from rollouts."""
+        """Whether the actor's step trains it, in agents that learn an actor from rollouts."""
         return type(self).join is Nothing.join
 
     @property

@@ -147,12 +147,12 @@ class Recurrent(Remembering):
     A gated recurrent unit reads every step once it is over, so that with s_t networks see all that is known before it:
         h_(t+1) = GRU(h_t, [s_t, a_t, r_t, e_t]),  h_0 = 0                 (e_t: the step ended an episode)
     Where a time limit cuts sums off, the value after the step is that of going on: of h_(t+1) with e_t = 0. The unit
-    learns through the steps of a window, by the loss of an actor that learns from rollouts, else by the critics'.
-    A window begins with the hidden state that acting had there, which does not learn.
+    learns through the steps of a window, by the critics' loss, or in the step of an actor that learns from rollouts, by
+    both losses. A window begins with the hidden state that acting had there, which does not learn.
 
     Differs from RL^2, where the unit reads s_t and the step before it at once, and the policy sees its output alone.
-    Here the policy sees s_t beside h_t, which hold the same. A critic of states sees the policy's memory and
-    does not teach it; in RL^2 the baseline has a memory of its own.
+    Here the policy sees s_t beside h_t, which hold the same. A critic of states sees the same h_t; in RL^2 the
+    baseline has a memory of its own.
     """
 
     recurrent_size: int = 64
