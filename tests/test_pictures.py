@@ -230,6 +230,11 @@ def test_the_smallest_pictures_have_features(name):
         InputError, match=rf"vision={name} takes pictures of at least {side} x {side}, not \({side - 1}"
     ):
         encoded.require(seen(side - 1))
+    for other, beside in (("deepmdp", {}), ("asymmetric", {"state": jax.ShapeDtypeStruct((2,), jnp.float32)})):
+        representation = mtjax.agent("sac", representation=other, vision=name).representation
+        representation.require(seen(side) | beside)
+        with pytest.raises(InputError, match=rf"vision={name} takes pictures of at least {side}"):
+            representation.require(seen(side - 1) | beside)
     Encoded(latent_widths=()).require(seen(15))
     with pytest.raises(InputError, match="latent-widths needs at least one layer"):
         Encoded(latent_widths=()).require(jnp.zeros(5))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents.networks import orthogonal
 from mtjax.agents.parts.convolution import Transposed, convolve
-from mtjax.types import Array, Key, Transition
+from mtjax.types import Array, InputError, Key, Transition
 
 Vision = Literal["drq", "impala", "grid"]
 _FILTERS = 32
@@ -74,6 +74,20 @@ class Cells(nn.Module):
 NETWORKS: dict[str, type[nn.Module]] = {"drq": Convolutions, "impala": Residual, "grid": Cells}
 LEAST: dict[str, int] = {"drq": 15, "impala": 1, "grid": 3}
 """Height and width of the smallest pictures that each network takes."""
+
+
+def require_large(vision: Vision, obs: Any) -> None:
+    """Check that pictures, if an observation of these shapes has some, are as large as a network needs.
+
+    Raises:
+        InputError: they are smaller.
+    """
+    if not frames.shown(obs):
+        return
+    picture, least = obs[frames.PICTURES].shape, LEAST[vision]
+    if min(picture[:2]) < least:
+        told = f"vision={vision} takes pictures of at least {least} x {least}, not {picture}"
+        raise InputError(f"{told}; for grids of few cells use --agent.vision=grid")
 
 
 def project(features: Array, size: int) -> Array:

@@ -9,7 +9,7 @@ from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.representations.base import Plain
-from mtjax.agents.parts.vision import Sight, Vision, shift_pictures
+from mtjax.agents.parts.vision import Sight, Vision, require_large, shift_pictures
 from mtjax.types import Array, InputError, Key, Transition
 
 
@@ -51,6 +51,7 @@ class Asymmetric(Plain):
                 "representation=asymmetric shows pictures to the actor and the state to the critics; "
                 "give --env.pixels=64 --env.state=also"
             )
+        require_large(self.vision, obs)
 
     def acts_on(self, obs: Any) -> Any:
         return {frames.PICTURES: obs[frames.PICTURES]}

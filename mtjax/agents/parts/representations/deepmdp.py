@@ -151,6 +151,7 @@ class DeepMDP(Encoded):
 
     def require(self, obs: Any) -> None:
         require_one_sense(obs)
+        super().require(obs)
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
         return self.dynamics.targets(encode_tasks(self, target_params, next_obs), key)

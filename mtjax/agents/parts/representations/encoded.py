@@ -13,8 +13,8 @@ from mtjax.agents import parts
 from mtjax.agents.networks import MLP, OVER_TASKS, Network, Params
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.agents.parts.representations.base import Plain
-from mtjax.agents.parts.vision import LEAST, NETWORKS, Projection, Vision, project, shift_pictures
-from mtjax.types import Array, InputError, Key, Transition
+from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project, require_large, shift_pictures
+from mtjax.types import Array, Key, Transition
 
 ENCODERS = ("latent",)
 PROJECTION = "projection"
@@ -42,11 +42,7 @@ def require_visible(encoded: "Encoded", obs: Any) -> None:
     """
     if not frames.shown(obs):
         parts.require_layers(encoded, "latent_widths")
-        return
-    picture, least = obs[frames.PICTURES].shape, LEAST[encoded.vision]
-    if min(picture[:2]) < least:
-        told = f"vision={encoded.vision} takes pictures of at least {least} x {least}, not {picture}"
-        raise InputError(f"{told}; for grids of few cells use --agent.vision=grid")
+    require_large(encoded.vision, obs)
 
 
 @dataclasses.dataclass(frozen=True)
