@@ -23,13 +23,12 @@ the last episode's differences from ``told`` and from ``blind``, over pairs of s
 
 import argparse
 import itertools
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
 import learning
 import numpy as np
-from parts import add_flags, is_part, require_all, whole
+from parts import add_flags, dated, is_part, require_all, whole
 from report import markdown, run_main
 
 import mtjax
@@ -63,7 +62,7 @@ def main() -> None:
     parser.add_argument("--env", nargs="*", default=[], metavar="NAME=VALUE", help="settings of families: size=3")
     parser.add_argument("--vary", nargs="*", default=[], metavar="NAME=VALUES", help="besides what the family varies")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="of the loop or all rungs")
-    parser.add_argument("--out", type=Path, default=Path("runs") / f"adaptation-{time.strftime('%Y%m%d-%H%M%S')}")
+    parser.add_argument("--out", type=Path, default=dated("adaptation"))
     add_flags(parser)
     arguments = parser.parse_args()
     if min(arguments.trials, arguments.eval_trials) < 1:

@@ -12,11 +12,11 @@ have a policy are not run again. A signal ends the program, and the same command
 
 import argparse
 import shutil
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from parts import dated
 from report import note_origin, read_lines, run_main, write_lines
 from resumable import train
 
@@ -64,7 +64,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("families", nargs="*", metavar="NAME", help="by default all of TRAINED")
     parser.add_argument("--seconds", type=float, default=400.0, help="of training, after which a run ends")
-    parser.add_argument("--out", type=Path, default=Path("runs") / f"families-{time.strftime('%Y%m%d-%H%M%S')}")
+    parser.add_argument("--out", type=Path, default=dated("families"))
     arguments = parser.parse_args()
     for name in arguments.families:
         if name not in TRAINED:

@@ -40,13 +40,12 @@ import itertools
 import json
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from parts import Part, add_flags, is_part, require_all, run_parts, whole, write_result
+from parts import Part, add_flags, dated, is_part, require_all, run_parts, whole, write_result
 from report import markdown, note_origin, read_lines, record, run_main, settings_of, texts_of, write_lines
 from resumable import train
 
@@ -138,7 +137,7 @@ def main() -> None:
     parser.add_argument("--mark", type=float, default=900.0, help="the return whose time is told")
     parser.add_argument("--baseline", default="sac-conditioned", metavar="NAME", help="what differences are against")
     parser.add_argument("--unfinished", action="store_true", help=UNFINISHED)
-    parser.add_argument("--out", type=Path, default=Path("runs") / f"learning-{time.strftime('%Y%m%d-%H%M%S')}")
+    parser.add_argument("--out", type=Path, default=dated("learning"))
     add_flags(parser)
     arguments = parser.parse_args()
     arguments.equal_to = "" if arguments.best else arguments.baseline

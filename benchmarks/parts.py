@@ -46,6 +46,18 @@ def add_flags(parser: argparse.ArgumentParser, seconds: float | None = None) -> 
     )
 
 
+def add_peer_flags(parser: argparse.ArgumentParser, name: str, words: tuple[str, ...], **given: Any) -> None:
+    """Add the flags of a comparison called ``name``: where results go, a part by its ``words``, and ``add_flags``'s."""
+    parser.add_argument("--out", type=Path, default=dated(name))
+    parser.add_argument("--part", nargs=len(words), metavar=words, help="run this part in this process")
+    add_flags(parser, **given)
+
+
+def dated(name: str) -> Path:
+    """Return a folder for the results of a benchmark that begins now."""
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
 def run_ways(
     script: str,
     arguments: argparse.Namespace,

@@ -34,7 +34,6 @@ import os
 import statistics
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,9 +77,7 @@ def main() -> None:
     parser.add_argument("--marks", type=float, nargs="+", default=[500, 700, 850])
     parser.add_argument("--enough", type=float, default=float("inf"), help="a return that ends a run")
     parser.add_argument("--smaller", type=int, default=1, help="divide worlds and batches by this, to try the script")
-    parser.add_argument("--out", type=Path, default=Path("runs") / f"ppo-peer-{time.strftime('%Y%m%d-%H%M%S')}")
-    parser.add_argument("--part", nargs=3, metavar=("TASK", "SIDE", "SEED"), help="run this part in this process")
-    parts.add_flags(parser, seconds=300)
+    parts.add_peer_flags(parser, "ppo-peer", ("TASK", "SIDE", "SEED"), seconds=300)
     arguments = parser.parse_args()
     if arguments.part:
         env, side, seed = arguments.part

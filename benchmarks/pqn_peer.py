@@ -44,10 +44,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--steps", type=int, default=10_000_000, help="of each seed; the authors' number")
     parser.add_argument("--episodes", type=int, default=20, help="of each of our seeds")
-    default = Path("runs") / f"pqn-peer-{time.strftime('%Y%m%d-%H%M%S')}"
-    parser.add_argument("--out", type=Path, default=default)
-    parser.add_argument("--part", nargs=2, metavar=("GAME", "SIDE"), help="run this part in this process")
-    parts.add_flags(parser)
+    parts.add_peer_flags(parser, "pqn-peer", ("GAME", "SIDE"))
     arguments = parser.parse_args()
     pairs = [(game, side) for game in arguments.games for side in arguments.sides]
     parts.run_pairs(__file__, arguments, pairs, play, tabulate)

@@ -38,10 +38,7 @@ def main() -> None:
     parser.add_argument("--sides", nargs="+", default=list(SIDES), choices=SIDES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 10, 100])
     parser.add_argument("--steps", type=int, default=5_242_880, help="of each seed; rejax's own number")
-    default = Path("runs") / f"rejax-peer-{time.strftime('%Y%m%d-%H%M%S')}"
-    parser.add_argument("--out", type=Path, default=default)
-    parser.add_argument("--part", nargs=2, metavar=("SIDE", "SEEDS"), help="run this part in this process")
-    parts.add_flags(parser)
+    parts.add_peer_flags(parser, "rejax-peer", ("SIDE", "SEEDS"))
     arguments = parser.parse_args()
     pairs = [(side, seeds) for seeds in arguments.seeds for side in arguments.sides]
     parts.run_pairs(__file__, arguments, pairs, play, tabulate)

@@ -22,7 +22,6 @@ import os
 import statistics
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +53,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, help="transitions, over all tasks; by default 4000, on a CPU 400")
     parser.add_argument("--steps", type=int, default=100, help="steps of every environment in a timed chunk")
     parser.add_argument("--repeats", type=int, default=5, help="rounds")
-    parser.add_argument("--out", type=Path, default=Path("runs") / f"scaling-{time.strftime('%Y%m%d-%H%M%S')}")
+    parser.add_argument("--out", type=Path, default=parts.dated("scaling"))
     parser.add_argument("--json", help="write the figures to this file too")
     parser.add_argument("--plots", type=Path, help="draw scaling-AXIS.png into this folder")
     parser.add_argument("--part", nargs=2, metavar=("AXIS", "VALUE"), help="time this setting in this process")

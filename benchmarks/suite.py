@@ -43,7 +43,6 @@ sentence-transformers.
 import argparse
 import dataclasses
 import itertools
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -51,7 +50,7 @@ from typing import NamedTuple
 import atari
 import learning
 import numpy as np
-from parts import add_flags, is_part, require_all
+from parts import add_flags, dated, is_part, require_all
 from report import markdown, run_main, write_lines
 
 import mtjax
@@ -269,7 +268,7 @@ def main() -> None:
         if not suite.adapt or arguments.adapt < 1:
             raise InputError("--adapt is a number of episodes from 1 on, of suites that adapt: ml1, ml10, ml45")
         suite = dataclasses.replace(suite, adapt=arguments.adapt)
-    arguments.out = arguments.out or Path("runs") / f"{arguments.suite}-{time.strftime('%Y%m%d-%H%M%S')}"
+    arguments.out = arguments.out or dated(arguments.suite)
     arguments.equal_to = "" if arguments.best else suite.equal_to
     agents = suite.agents if arguments.agents is None else arguments.agents
     named = [(env, agent) for env in arguments.envs or suite.envs for agent in agents]
