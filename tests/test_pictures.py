@@ -230,7 +230,8 @@ def test_the_smallest_pictures_have_features(name):
         InputError, match=rf"vision={name} takes pictures of at least {side} x {side}, not \({side - 1}"
     ):
         encoded.require(seen(side - 1))
-    for other, beside in (("deepmdp", {}), ("asymmetric", {"state": jax.ShapeDtypeStruct((2,), jnp.float32)})):
+    also = {"state": jax.ShapeDtypeStruct((2,), jnp.float32)}
+    for other, beside in (("deepmdp", {}), ("hip-bmdp", {}), ("asymmetric", also)):
         representation = mtjax.agent("sac", representation=other, vision=name).representation
         representation.require(seen(side) | beside)
         with pytest.raises(InputError, match=rf"vision={name} takes pictures of at least {side}"):

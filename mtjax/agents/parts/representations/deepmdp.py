@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.networks import Params, Trunk
-from mtjax.agents.parts.representations.encoded import Encoded, apply_part, encode_tasks
+from mtjax.agents.parts.representations.encoded import Encoded, apply_part, encode_tasks, require_visible
 from mtjax.types import Array, InputError, Key, Metrics
 
 Transitions = Literal["deterministic", "probabilistic"]
@@ -151,7 +151,7 @@ class DeepMDP(Encoded):
 
     def require(self, obs: Any) -> None:
         require_one_sense(obs)
-        super().require(obs)
+        require_visible(self, obs)  # by name, as other classes have this method too
 
     def targets(self, params: Params, target_params: Params, next_obs: Any, key: Key) -> tuple[ModelTargets, Key]:
         return self.dynamics.targets(encode_tasks(self, target_params, next_obs), key)
