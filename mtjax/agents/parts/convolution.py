@@ -57,6 +57,29 @@ def convolve(pictures: Array, filters: Array, strides: Sequence[int], padding: A
     return CONVOLVE.bind(pictures, filters, **shapes, **settings)  # type: ignore
 
 
+def multiply_patches(pictures: Array, filters: Array, strides: Sequence[int], padding: Any, **_: Any) -> Array:
+    """Do what ``convolve`` does, without strides and padding, as one product of all patches with the filters.
+
+    The filters of all seeds are then one product too. Patches of large pictures would take much memory.
+
+    Args:
+        pictures: (N, H, W, C).
+        filters: (h, w, C, F).
+
+    Returns:
+        (N, H - h + 1, W - w + 1, F).
+
+    Raises:
+        NotImplementedError: it has strides or padding.
+    """
+    if padding != "VALID" or any(step != 1 for step in strides):
+        raise NotImplementedError("patches are of every place, without padding; take convolve")
+    rows, columns = filters.shape[:2]
+    height, width = pictures.shape[1] - rows + 1, pictures.shape[2] - columns + 1
+    moved = [pictures[:, i : i + height, j : j + width] for i in range(rows) for j in range(columns)]
+    return jnp.concatenate(moved, axis=-1) @ filters.reshape(-1, filters.shape[-1])
+
+
 class Transposed(nn.Module):
     """Layer that maps features to pictures, as the gradient of a convolution of 3 x 3 without padding does."""
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from mtjax import frames
 from mtjax.agents.networks import orthogonal
-from mtjax.agents.parts.convolution import Transposed, convolve
+from mtjax.agents.parts.convolution import Transposed, convolve, multiply_patches
 from mtjax.types import Array, InputError, Key, Transition
 
 Vision = Literal["drq", "impala", "grid"]
@@ -67,7 +67,8 @@ class Cells(nn.Module):
     @nn.compact
     def __call__(self, pictures: Array) -> Array:
         """Map pictures (..., H, W, K) to features (..., F)."""
-        x = _Conv(_OF_CELLS, (3, 3), padding="VALID")(pictures.astype(jnp.float32) / 255)
+        x = pictures.astype(jnp.float32) / 255
+        x = nn.Conv(_OF_CELLS, (3, 3), padding="VALID", conv_general_dilated=multiply_patches)(x)
         return nn.relu(nn.LayerNorm()(x)).reshape(*x.shape[:-3], -1)
 
 
