@@ -386,7 +386,7 @@ def require_alike(expected, found):
             assert np.all(difference <= 0.05 * size + 1e-7), (jax.tree_util.keystr(path), difference / size)
 
 
-@pytest.mark.parametrize("vision", ["drq", "impala"])
+@pytest.mark.parametrize("vision", ["drq", "impala", "grid"])
 @pytest.mark.parametrize("name", ["drq", "sac-ae"])
 def test_agents_learn_from_pictures_as_on_the_cpu(name, vision):
     """Three seeds, whose convolutions follow one another."""
