@@ -20,8 +20,8 @@ from parts import dated
 from report import note_origin, read_lines, run_main, write_lines
 from resumable import train
 
-import mtjax
 from mtjax.compiling.programs import enable_compile_cache
+from mtjax.config import with_preset
 from mtjax.names import nearest_error
 from mtjax.saved import policy_files
 
@@ -54,9 +54,30 @@ TRAINED = {  # family -> agent and steps
     "point-mass-easy": ("ppo", 10 * _M),
     "two-goal-maze": ("drq", 4 * _M),
     "two-goal-maze-seen": ("ppo", 10 * _M),
+    "point-mass-vary-goal": ("sac-conditioned", 4 * _M),
+    "bandit": ("ppo", _M // 10),
+    "tabular-mdp": ("ppo", _M // 4),
+    **{f"control-{name}": ("ppo", 4 * _M) for name in ("cartpole", "acrobot")},
+    **{name: ("ppo", 2 * _M) for name in ("link", "racing", "sailing", "trading", "light-world", "coloured-maze")},
+    **{name: ("sketches", 10 * _M) for name in ("craft-sketched", "light-world-sketched", "errands")},
+    "craft": ("ppo", 10 * _M),
+    **{name: ("ppo", 2 * _M) for name in ("claw", "tabletop")},
+    **{
+        f"brax-{name}": ("ppo", 20 * _M)
+        for name in ("ant", "ant-vary-direction", "halfcheetah", "halfcheetah-vary-speed")
+    },
+    **{f"brax-{name}": ("ppo", 20 * _M) for name in ("hopper", "walker2d", "humanoid", "humanoidstandup")},
+    **{f"brax-{name}": ("ppo", 10 * _M) for name in ("reacher", "pusher", "fast")},
+    **{f"brax-inverted-{name}": ("ppo", 10 * _M) for name in ("pendulum", "double-pendulum")},
+    "grid-navi": ("rl2", 3 * _M),
+    "hidden-bandit": ("rl2", _M),
 }
-SEEN: dict[str, dict[str, Any]] = {"two-goal-maze": {"pixels": 64, "scores": True}}
-"""Settings of families that are learned from pictures, as nothing else tells the goal."""
+SETTINGS: dict[str, dict[str, Any]] = {
+    "two-goal-maze": {"pixels": 64, "scores": True},  # pictures, as nothing else tells the goal
+    "grid-navi": {"training_settings": {"trials": 4}, "agent_settings": {"unroll": 60}},
+    "hidden-bandit": {"training_settings": {"trials": 10}, "agent_settings": {"unroll": 10}},
+}
+"""Settings with which families are learned, beside those of the preset."""
 _LINES = 40
 
 
@@ -80,7 +101,7 @@ def main() -> None:
 
 def learn(name: str, agent: str, steps: int, folder: Path, seconds: float) -> None:
     """Train a family until it has made its steps or its time is over; keep the curve and the policy."""
-    run, program = folder / "run", mtjax.preset(name, agent, **SEEN.get(name, {}))
+    run, program = folder / "run", with_preset(name, agent, **SETTINGS.get(name, {}))
     result = train(
         run,
         program.family,
@@ -88,7 +109,7 @@ def learn(name: str, agent: str, steps: int, folder: Path, seconds: float) -> No
         seconds,
         steps=steps,
         eval_every=steps,
-        eval_episodes=5,
+        eval_episodes=5 * program.training.trials,
         settings=program.training,
         quiet=False,
     )

@@ -102,12 +102,14 @@ def expected_batch(chain, pi, ends, over):
     pi, over, zeros = jnp.log(pi), jnp.log(over), jnp.zeros(len(rows))
     return Batch(
         obs=EYE[s],
-        raw=jnp.int32(a),
-        log_prob=pi[s, option, a],
-        before=jnp.int32(before),
-        option=jnp.int32(option),
-        chosen=jnp.asarray(chosen),
-        option_log_prob=over[s, option],
+        taken=Taken(
+            raw=jnp.int32(a),
+            log_prob=pi[s, option, a],
+            before=jnp.int32(before),
+            now=Running(jnp.int32(option), jnp.ones(len(option))),
+            chosen=jnp.asarray(chosen),
+            option_log_prob=over[s, option],
+        ),
         advantage=advantage,
         choice_advantage=choice,
         end_loss=end,
@@ -143,19 +145,21 @@ def test_a_step_moves_the_option_that_took_it_and_the_one_that_ended_alone():
     nets = of_task(begun(agent).nets, 0)
     chain = Chain.drawn()
     batch = pick(expected_batch(chain, *tables(agent, nets)), np.array([0]))
-    batch = batch._replace(before=jnp.int32([1]), end_loss=jnp.ones(1), choice_advantage=jnp.ones(1))
+    took = lambda batch, **given: batch._replace(taken=batch.taken._replace(**given))
+    batch = took(batch, before=jnp.int32([1]))._replace(end_loss=jnp.ones(1), choice_advantage=jnp.ones(1))
     loss = lambda nets, batch: agent.actor_loss(nets, batch, jax.random.key(0))[0]
     grad = jax.jit(jax.grad(loss, allow_int=True), compiler_options=QUICK)
     found = grad(nets, batch)
-    assert batch.option[0] == 0 and not batch.chosen[0]
+    assert batch.taken.now.option[0] == 0 and not batch.taken.chosen[0]
     for name, option in (("actor", 0), ("termination", 1)):
         for leaf in jax.tree.leaves(found[name].shared):
             assert not np.any(leaf[1 - option])
         assert np.any(found[name].shared["head"]["bias"][option])
     assert not any(np.any(x) for x in jax.tree.leaves(found["over_options"]))
-    none = grad(nets, batch._replace(before=jnp.int32([NONE])))
+    none = grad(nets, took(batch, before=jnp.int32([NONE])))
     assert not any(np.any(x) for x in jax.tree.leaves(none["termination"]))
-    assert any(np.any(x) for x in jax.tree.leaves(grad(nets, batch._replace(chosen=jnp.ones(1, bool)))["over_options"]))
+    chose = grad(nets, took(batch, chosen=jnp.ones(1, bool)))
+    assert any(np.any(x) for x in jax.tree.leaves(chose["over_options"]))
 
 
 # Targets.
@@ -184,7 +188,7 @@ def test_targets_are_those_of_a_plain_loop(how):
     state = begun(agent)
     steps = rollout(agent, state)
     _, after = quick(agent.assess, state, steps, TASKS)(state, steps, TASKS)
-    _, found = after.extras
+    found = after.extras
     wanted = {name: np.zeros(steps.reward.shape) for name in ("advantage", "choice", "end", "target")}
     for i in (0, 1):
         nets, features = of_task(state.nets, i), TASKS.context[i]
@@ -207,10 +211,10 @@ def test_targets_are_those_of_a_plain_loop(how):
     std = wanted["advantage"].std((1, 2), keepdims=True) if how == "task" else 1.0
     mean = wanted["advantage"].mean((1, 2), keepdims=True) if how == "task" else 0.0
     close = lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-4)
-    close(found["target"], wanted["target"])
-    close(found["advantage"], (wanted["advantage"] - mean) / std)
-    close(found["choice_advantage"], wanted["choice"] / std)
-    close(found["end_loss"], wanted["end"] / std)
+    close(found.target, wanted["target"])
+    close(found.advantage, (wanted["advantage"] - mean) / std)
+    close(found.choice_advantage, wanted["choice"] / std)
+    close(found.end_loss, wanted["end"] / std)
 
 
 def test_the_batch_is_what_was_stored():
@@ -218,9 +222,9 @@ def test_the_batch_is_what_was_stored():
     state = begun(agent)
     _, batch, steps = assessed(agent, state, rollout(agent, state), TASKS)
     flat = jax.tree.map(lambda x: x[:, :, 0], windows(steps, 0))
-    np.testing.assert_array_equal(batch.option, flat.extras[0].now.option)
-    np.testing.assert_array_equal(batch.before, flat.extras[0].before)
-    np.testing.assert_array_equal(batch.advantage, flat.extras[1]["advantage"])
+    np.testing.assert_array_equal(batch.taken.now.option, flat.extras.taken.now.option)
+    np.testing.assert_array_equal(batch.taken.before, flat.extras.taken.before)
+    np.testing.assert_array_equal(batch.advantage, flat.extras.advantage)
 
 
 # Acting.

@@ -43,21 +43,27 @@ class Taken(NamedTuple):
     option_log_prob: Array  # () its log-probability under the policy over options
 
 
+class Assessed(NamedTuple):
+    """Holds what is stored with an action once the rollout is over."""
+
+    taken: Taken
+    advantage: Array  # () of the action in its option, normalised
+    choice_advantage: Array  # () of the option, if it was chosen here
+    end_loss: Array  # () what is lost where the option that ran before ends here
+    value: Array  # () of the option before the update, in units of reward
+    target: Array  # () what the critic's output for the option should be
+
+
 class Batch(NamedTuple):
     """Holds the data for the losses of one task; for all tasks, leaves are (T, ...)."""
 
     obs: Any  # (B, O) as the networks take them
-    raw: Array  # (B, ...)
-    log_prob: Array  # (B,)
-    before: Array  # (B,) int32
-    option: Array  # (B,) int32, that took the action
-    chosen: Array  # (B,) bool
-    option_log_prob: Array  # (B,)
-    advantage: Array  # (B,) of the action in its option, normalised
-    choice_advantage: Array  # (B,) of the option, if it was chosen here
-    end_loss: Array  # (B,) what is lost where the option that ran before ends here
-    value: Array  # (B,) of the option before the update, in units of reward
-    target: Array  # (B,) what the critic's output for the option should be
+    taken: Taken  # leaves (B, ...)
+    advantage: Array  # (B,) and so on, as ``Assessed`` has them
+    choice_advantage: Array
+    end_loss: Array
+    value: Array
+    target: Array
     features: Array  # (Z,) or (B, Z) features of the task that need no learned parameters
     mask: Array | None  # (A,) 1 for actions that the task has, else 0; None: it has all
 
@@ -256,14 +262,15 @@ class Options(OnPolicy):
         target = value + advantage
         state, units = critics.renew(self, state, target)
         mean, spread = clipped_ratio.moments(self.advantage_normalization, advantage)
-        found = {
-            "advantage": (advantage - mean) / spread,
-            "choice_advantage": (target - of_state) / spread,
-            "end_loss": (of_before - of_state + self.deliberation_cost) / spread,
-            "value": value,
-            "target": units.outputs(target),
-        }
-        return state, steps._replace(extras=(steps.extras, found))
+        found = Assessed(
+            taken=steps.extras,
+            advantage=(advantage - mean) / spread,
+            choice_advantage=(target - of_state) / spread,
+            end_loss=(of_before - of_state + self.deliberation_cost) / spread,
+            value=value,
+            target=units.outputs(target),
+        )
+        return state, steps._replace(extras=found)
 
     # Losses of one task.
 
@@ -275,22 +282,23 @@ class Options(OnPolicy):
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:  # type: ignore[override]
         _, seen = self.view.actor_inputs(nets, batch.features, batch.obs)
-        outputs = for_actions(self, nets, seen, batch.option)
-        log_ratio = limited(self.policy.log_prob(outputs, batch.raw, batch.mask) - batch.log_prob)
+        taken, option = batch.taken, batch.taken.now.option
+        outputs = for_actions(self, nets, seen, option)
+        log_ratio = limited(self.policy.log_prob(outputs, taken.raw, batch.mask) - taken.log_prob)
         gain, metrics = clipped_ratio.gain(self, log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
 
-        logs, chosen = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs)), batch.chosen
-        option_ratio = limited(at_option(logs, batch.option) - batch.option_log_prob)
+        logs = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs))
+        option_ratio = limited(at_option(logs, option) - taken.option_log_prob)
         choice, _ = clipped_ratio.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
 
-        ends = ends_of(self, nets, seen, batch.before, batch.mask)
-        runs = batch.before != NONE
+        ends = ends_of(self, nets, seen, taken.before, batch.mask)
+        runs = taken.before != NONE
         loss = (
             jnp.mean(runs * ends * batch.end_loss)
             - jnp.mean(gain)
-            - jnp.mean(chosen * (choice + self.choice_entropy_cost * doubt))
+            - jnp.mean(taken.chosen * (choice + self.choice_entropy_cost * doubt))
             - self.entropy_cost * entropy
         )
         kl = jnp.mean(jnp.exp(log_ratio) - 1 - log_ratio)
@@ -299,16 +307,13 @@ class Options(OnPolicy):
         return loss, ActorAux(told, kl)
 
     def critic_loss(self, nets: Nets, batch: Batch) -> tuple[Array, Metrics]:  # type: ignore[override]
-        output = at_option(self.output(nets, batch.features, batch.obs), batch.option)
+        output = at_option(self.output(nets, batch.features, batch.obs), batch.taken.now.option)
         loss = self.fitting_loss(output, batch)  # type: ignore[arg-type]
         return self.view.join(loss, {"critic_loss": loss}, nets, batch)
 
     def prepare(self, state: AgentState, window: Transition, tasks: Task) -> tuple[AgentState, Batch]:  # type: ignore
         flat, features, obs, _ = self.view.steps(state, window, tasks)
-        taken, found = flat.extras
-        given = {name: x for name, x in taken._asdict().items() if name != "now"}
-        batch = Batch(obs=obs, option=taken.now.option, features=features, mask=tasks.action_mask, **given, **found)
-        return state, batch
+        return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **flat.extras._asdict())
 
 
 def chooser(agent: Any) -> Network:
