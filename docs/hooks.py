@@ -26,6 +26,7 @@ from mkdocs.structure.files import File, Files
 from mtjax import agents, envs
 from mtjax.agents.hyperparameters import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
 from mtjax.envs.pixels import Pictured
@@ -119,7 +120,7 @@ def addresses() -> dict[str, str]:
 def llms(config: Any, files: Files) -> str:
     """Return llms.txt, a list of all pages with what each is about, for programs that read the site."""
     root = (config.site_url or "").rstrip("/")
-    lines = [f"# {config.site_name}", "", f"> {config.site_description}. Commands are whole and run as they stand."]
+    lines = [f"# {config.site_name}", "", f"> {config.site_description}. Commands are whole and run as they stand; runs/... is a run of yours."]
     for entry in config.nav:
         ((title, inside),) = entry.items()
         lines += ["", f"## {title}", ""]
@@ -181,7 +182,7 @@ def family_page(name: str) -> str:
     """Return the page of one family: command, docstring, parameters, tasks and figures."""
     cls, _ = envs.ENVS[name]
     family = envs.make(name)
-    text = f"# {name}\n\n{_picture(name)}```bash\npython -m mtjax.train --env={name}\n```\n\n"
+    text = f"# {name}\n\n{_picture(name)}{_command(family_flags(name))}"
     text += f"{to_markdown(cls.__doc__)}\n" + "".join(_inherited(base) for base in _described_bases(cls))
     if family.parameters:
         text += "\n## Parameters\n\n| parameter | unit | nominal | in this family |\n|---|---|---|---|\n"
@@ -192,6 +193,25 @@ def family_page(name: str) -> str:
             text += f"| `{key}` | {parameter.unit} | {nominal} | {given} |\n"
     text += _family_figures(name)
     return text + _family_settings(family)
+
+
+def _command(*lines: str) -> str:
+    """Return commands that train, by their flags."""
+    return "\n".join(["```bash", *(f"python -m mtjax.train {flags}" for flags in lines), "```\n\n"])
+
+
+def family_flags(name: str) -> str:
+    """Return the flags of a command that trains a family by an agent that draws its actions."""
+    spec = envs.make(name).spec
+    if spec.action.kind == "continuous":
+        return f"--env={name}"
+    return f"--env={name} {_TRIALS.get(name) or ('--agent=sketches' if spec.symbols else '--agent=ppo')}"
+
+
+_TRIALS = {  # families whose tasks are hidden -> an agent that finds them out
+    "grid-navi": "--agent=rl2 --trials=4 --agent.unroll=60",
+    "hidden-bandit": "--agent=rl2 --trials=10 --agent.unroll=10",
+}
 
 
 def _described_bases(cls: type) -> list[type]:
@@ -302,7 +322,7 @@ def _kind_table(kind: str) -> str:
 def agent_page(name: str) -> str:
     """Return the page of one agent: command, docstrings of agent and parts, settings and figures."""
     preset, agent = agents.AGENTS[name], agents.agent(name)
-    text = f"# {name}\n\n{preset.says}.\n\n```bash\npython -m mtjax.train --agent={name}\n```\n\n"
+    text = f"# {name}\n\n{preset.says}.\n\n{_command(*agent_flags(name))}"
     if preset.defaults:
         pairs = ", ".join(f"`{key}={value}`" for key, value in preset.defaults.items())
         text += f"It is `{preset.cls.__name__}` with {pairs}.\n\n"
@@ -312,6 +332,18 @@ def agent_page(name: str) -> str:
             part = getattr(agent, kind)
             text += f"\n## {kind}: {name_of(PARTS[kind], part)}\n\n{to_markdown(type(part).__doc__)}\n"
     return text + _agent_figures(name) + _settings(agent)
+
+
+def agent_flags(name: str) -> list[str]:
+    """Return the flags of commands that train by an agent, one after another, on tasks that it can learn."""
+    cls = agents.AGENTS[name].cls
+    if agents.AGENTS[name].sees_pictures:
+        return [f"--env=finger-spin-vary-size --agent={name} --env.pixels=64 --env.frames=3 --env.repeat=2"]
+    if cls.follows_sketches:
+        return [f"--env=craft-sketched --agent={name}"]
+    if cls.taught:
+        return ["--env=point-mass-vary-goal", f"--env=point-mass-vary-goal --agent={name} --from=runs/..."]
+    return [f"--agent={name}" if Gaussian in cls.policies else f"--env=bandit --agent={name}"]
 
 
 def _settings(agent: Any) -> str:

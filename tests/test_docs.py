@@ -17,6 +17,8 @@ import mtjax
 from mtjax.agents import AGENTS
 from mtjax.command.run_config import parse
 from mtjax.envs import ENVS, SUITES
+from mtjax.saved.config_json import write_config
+from mtjax.training.launch import check
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -164,6 +166,42 @@ def test_pages_of_families_have_one_shape(hooks):
             page = "\n\n".join(hooks.to_markdown(each.__doc__) for each in (cls, *hooks._described_bases(cls)))
             lacks = [x for x in ("Observation", "Action", "Reward", "Start", "Episode") if f"**{x}" not in page]
             assert not lacks, (name, lacks)
+
+
+def check_commands(page, teacher):
+    """Take all that a made page trains up to the check, with a run where the reader's own is meant."""
+    whole = [[word.replace("runs/...", str(teacher)) for word in each] for each in training(page)]
+    assert whole
+    for each in whole:
+        check(parse(each))
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    """A folder with the configuration of a run that can teach ten goals."""
+    write_config(folder := tmp_path_factory.mktemp("teacher"), parse(["--env=point-mass-vary-goal"]))
+    return folder
+
+
+@needs("mkdocs")
+@pytest.mark.parametrize("name", AGENTS)
+def test_pages_of_agents_train_what_they_can_learn(hooks, teacher, name):
+    """The family has the actions, pictures, sketches and teachers that the agent needs."""
+    check_commands(hooks.agent_page(name), teacher)
+
+
+@needs("mkdocs")
+@pytest.mark.parametrize("name", ["bandit", "craft", "craft-sketched", "grid-navi", "hidden-bandit", "walker-walk"])
+def test_pages_of_families_train_an_agent_that_acts_there(hooks, teacher, name):
+    check_commands(hooks.family_page(name), teacher)
+
+
+@pytest.mark.slow
+@needs("mkdocs")
+def test_pages_of_all_families_train_an_agent_that_acts_there(hooks, teacher):
+    for name, (cls, _) in ENVS.items():
+        if cls.__module__.startswith("mtjax"):  # and not another test's own
+            check_commands(hooks.family_page(name), teacher)
 
 
 @needs("mkdocs")
