@@ -29,6 +29,7 @@ from mtjax.agents.parts import name_of
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
+from mtjax.envs.metaworld.scene import INSTALL
 from mtjax.envs.pixels import Pictured
 from mtjax.names import InputError, first_sentence
 from mtjax.report import figures
@@ -92,13 +93,22 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Name the owner's addresses where they belong."""
+    """Name the owner's addresses where they belong, and let the search rank pages by what they are."""
     known = addresses()
+    if boost := _boost(page.file.src_uri):
+        page.meta.setdefault("search", {"boost": boost})
     if known["repository"]:
         markdown = markdown.replace(_CLONE, f"git clone {known['repository']}")
     if known["doi"] and page.file.src_uri == "citing.md":
         markdown += f"\nDOI: <{known['doi']}>\n"
     return markdown
+
+
+def _boost(place: str) -> float | None:
+    """Return how much more than others a page counts in the search; None for as much."""
+    if place.startswith(("guide/", "how-to/")):
+        return 2
+    return 0.5 if place.startswith("results/") and place != "results/index.md" else None
 
 
 def on_post_page(output: str, **_: Any) -> str:
@@ -119,8 +129,12 @@ def addresses() -> dict[str, str]:
 
 def llms(config: Any, files: Files) -> str:
     """Return llms.txt, a list of all pages with what each is about, for programs that read the site."""
-    root = (config.site_url or "").rstrip("/")
-    lines = [f"# {config.site_name}", "", f"> {config.site_description}. Commands are whole and run as they stand; runs/... is a run of yours."]
+    root = f"{config.site_url.rstrip('/')}/" if config.site_url else ""  # or else links are relative
+    lines = [
+        f"# {config.site_name}",
+        "",
+        f"> {config.site_description}. Commands are whole and run as they stand; runs/... is a run of yours.",
+    ]
     for entry in config.nav:
         ((title, inside),) = entry.items()
         lines += ["", f"## {title}", ""]
@@ -145,8 +159,8 @@ def _entry(root: str, file: Any) -> str:
     title = re.search(r"^# (.+)$", text, re.M)
     plain = re.sub(r"(?m)^[#|!<].*$", "", re.sub(r"(?s)```.*?```", "", text))
     linked = lambda link: link[1] or ""
-    says = re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", linked, first_sentence(plain.strip()))
-    return f"- [{title[1] if title else file.name}]({root}/{file.url.removeprefix('./')}): {says}"
+    says = first_sentence(re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", linked, plain.strip())).removesuffix(":")
+    return f"- [{title[1] if title else file.name}]({root + file.url.removeprefix('./') or './'}): {says}"
 
 
 # Families.
@@ -182,8 +196,11 @@ def family_page(name: str) -> str:
     """Return the page of one family: command, docstring, parameters, tasks and figures."""
     cls, _ = envs.ENVS[name]
     family = envs.make(name)
-    text = f"# {name}\n\n{_picture(name)}{_command(family_flags(name))}"
-    text += f"{to_markdown(cls.__doc__)}\n" + "".join(_inherited(base) for base in _described_bases(cls))
+    before = [INSTALL] if ".metaworld." in cls.__module__ else []
+    text = f"# {name}\n\n{_picture(name)}{_command(family_flags(name), *_film_flags(name), before=before)}"
+    text += f"{to_markdown(cls.__doc__)}\n"
+    for base in _described_bases(cls):
+        text += _inherited(base, text)
     if family.parameters:
         text += "\n## Parameters\n\n| parameter | unit | nominal | in this family |\n|---|---|---|---|\n"
         vary = dict(family.vary)
@@ -195,9 +212,9 @@ def family_page(name: str) -> str:
     return text + _family_settings(family)
 
 
-def _command(*lines: str) -> str:
-    """Return commands that train, by their flags."""
-    return "\n".join(["```bash", *(f"python -m mtjax.train {flags}" for flags in lines), "```\n\n"])
+def _command(*lines: str, before: Iterable[str] = ()) -> str:
+    """Return commands that train, by their flags, behind those of the shell that they need."""
+    return "\n".join(["```bash", *before, *(f"python -m mtjax.train {flags}" for flags in lines), "```\n\n"])
 
 
 def family_flags(name: str) -> str:
@@ -214,15 +231,36 @@ _TRIALS = {  # families whose tasks are hidden -> an agent that finds them out
 }
 
 
+def _film_flags(name: str) -> list[str]:
+    """Return the flags of the agent that a family's film shows, if it is known and not the default one."""
+    rows = [(runs, row["agent"]) for runs in _FILMED for row in _runs_of(runs, name)]
+    if not (PICTURES / f"{name}.webp").exists() or not rows:
+        return []
+    runs, agent = rows[-1]
+    known = agent in agents.AGENTS and not agents.AGENTS[agent].sees_pictures
+    flags = f"--env={name} --agent={agent}"
+    return (
+        [f"{flags}    # as in the film{', on a GPU' * (runs == _ON_GPU)}"]
+        if known and flags != family_flags(name)
+        else []
+    )
+
+
 def _described_bases(cls: type) -> list[type]:
     """Return the classes that a family is made from, up to those that all families are made from."""
     bases = takewhile(lambda base: base not in (Domain, Pictured, Family), cls.__mro__[1:])
     return [base for base in bases if base.__doc__ and base.__module__.startswith("mtjax")]
 
 
-def _inherited(base: type) -> str:
-    title = f"\n## {base.__name__} {_UNSEARCHED}\n\nThe text above says what differs from this.\n\n"
-    return f"{title}{to_markdown(base.__doc__)}\n"
+def _inherited(base: type, above: str) -> str:
+    """Return the text of a class that a family is made from. What is told above of the family counts before it."""
+    text = (
+        f"\n## {base.__name__} {_UNSEARCHED}\n\nWhat stands here holds too, unless the text above says otherwise.\n\n"
+    )
+    told = to_markdown(base.__doc__)
+    if "**Reward**: " in above:  # of which the formula above takes terms
+        told = told.replace("**Reward**: ", "**Reward in general**: ")
+    return f"{text}{told}\n"
 
 
 def _family_settings(family: Any) -> str:

@@ -315,6 +315,6 @@ def test_site_builds_without_a_broken_link(tmp_path):
     for folder, names in zip(("families", "agents"), json.loads(fresh.stdout), strict=True):  # without other tests' own
         assert all((tmp_path / folder / name / "index.html").is_file() for name in names)
     listed = (tmp_path / "llms.txt").read_text()
-    assert "# mtjax" in listed and "[Which agent](/guide/which-agent/): Begin with one of three" in listed
+    assert "# mtjax" in listed and "[Which agent](guide/which-agent/): Begin with one of three" in listed
     assert max(map(weight, tmp_path.rglob("index.html"))) < 600_000
     assert "1.65 times sac" in (tmp_path / "agents" / "care" / "index.html").read_text()
