@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ import mtjax
 from mtjax.agents import AGENTS
 from mtjax.command.run_config import parse
 from mtjax.envs import ENVS, SUITES
+from mtjax.names import first_sentence
 from mtjax.saved.config_json import write_config
 from mtjax.training.launch import check
 
@@ -212,6 +214,53 @@ def test_pages_of_families_name_their_reward(hooks):
         assert "**Reward**: " in page and "**Observation (" in page
 
 
+@needs("mkdocs")
+def test_a_familys_page_has_one_reward_and_what_it_needs(hooks):
+    """A formula of the class that it is made from is called general; Meta-World's scenes are installed first."""
+    page = hooks.family_page("metaworld-push")
+    assert page.count("**Reward**: ") == 1 and "**Reward in general**: Meta-World's second version" in page
+    assert "```bash\npip install --no-deps metaworld==3.1.1\npython -m mtjax.train" in page
+    assert "pip install" not in hooks.family_page("hopper-stand")
+
+
+@needs("mkdocs")
+def test_a_film_names_the_agent_that_plays(hooks):
+    """By a command of its own, unless the page's first one trains it, or one alone does not do it."""
+    shown = "python -m mtjax.train --env=walker-run --agent=brc    # as in the film, on a GPU\n"
+    assert shown in hooks.family_page("walker-run")
+    assert hooks._film_flags("dog-stand") == hooks._film_flags("metaworld-push") == []
+
+
+def test_a_first_sentence_is_whole():
+    """It goes on behind names of authors, and ends before the next one, also one that begins with the library."""
+    assert first_sentence("It follows Teh et al. 2017 here. It learns.") == "It follows Teh et al. 2017 here"
+    assert first_sentence("It is new. mtjax has it.") == "It is new"
+    assert first_sentence("See ``a.b`` and c. d here.\n\nMore.") == "See ``a.b`` and c. d here"
+
+
+def test_every_extra_is_listed():
+    listed = (ROOT / "docs" / "guide" / "install.md").read_text()
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert [name for name in extras if not re.search(rf"^\| .*`{name}`.* \|", listed, re.M)] == []
+
+
+@needs("mkdocs")
+def test_the_search_ranks_what_explains_before_tables(hooks):
+    page = lambda place: SimpleNamespace(file=SimpleNamespace(src_uri=place), meta={})
+    pages = {place: page(place) for place in ("how-to/search.md", "results/speed-2.md", "results/index.md")}
+    for each in pages.values():
+        hooks.on_page_markdown("", each)
+    ranks = [each.meta.get("search") for each in pages.values()]
+    assert ranks == [{"boost": 2}, {"boost": 0.5}, None]
+
+
+@needs("mkdocs")
+def test_parts_of_a_page_are_called_by_their_titles(long_pages):
+    nav = [{"Results": [{"Speed": "results/speed.md"}, "results/index.md"]}]
+    long_pages._nest(nav, "results/speed.md", {"results/speed-2.md": long_pages._first("## [Of](a.md) `sac`, late\n")})
+    assert nav[0]["Results"][:2] == [{"Speed": "results/speed.md"}, {"Of sac, late": "results/speed-2.md"}]
+
+
 @pytest.fixture(scope="module")
 def formulas():
     return made_of("formulas")
@@ -276,7 +325,7 @@ def test_links_lead_to_the_part_that_has_their_anchor(long_pages):
 @needs("mkdocs")
 def test_addresses_stand_in_one_file(hooks, monkeypatch):
     """They reach the pages where they belong; without them nothing is said there."""
-    page = SimpleNamespace(file=SimpleNamespace(src_uri="citing.md"))
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="citing.md"), meta={})
     assert set(hooks.addresses()) == {"repository", "site", "doi"}
     known = {"repository": "https://host/me/mtjax", "site": "", "doi": "https://doi.org/1"}
     monkeypatch.setattr(hooks, "addresses", lambda: known)
