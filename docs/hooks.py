@@ -340,6 +340,36 @@ def _runs_of(runs: str, name: str) -> list[dict[str, str]]:
 # Agents.
 
 
+PAPERS = {  # agents -> the numbers of their papers at arXiv, of those that are known for certain
+    "sac": "1801.01290",
+    "distral": "1707.04175",
+    "care": "2102.06177",
+    "film": "1709.07871",
+    "moore": "2311.11385",
+    "soft-modularization": "2003.13661",
+    "paco": "2210.11653",
+    "brc": "2505.23150",
+    "simba-v2": "2502.15280",
+    "xqc": "2509.25174",
+    "deepmdp": "1906.02736",
+    "hip-bmdp": "2007.07206",
+    "drq": "2107.09645",
+    "sac-ae": "1910.01741",
+    "ppo": "1707.06347",
+    "impala": "1802.01561",
+    "rl2": "1611.02779",
+    "maml": "1703.03400",
+    "pqn": "2407.04811",
+    "sketches": "1611.01796",
+    "options": "1609.05140",
+    "distil": "1511.06295",
+    "pcgrad": "2001.06782",
+    "cagrad": "2110.14048",
+    "gradnorm": "1711.02257",
+    "famo": "2306.03792",
+}
+
+
 def agents_page() -> str:
     """Return the list of all agents."""
     text = "# Agents\n\nMost agents are a choice of parts, and every agent takes every part that fits it.\n\n"
@@ -360,7 +390,8 @@ def _kind_table(kind: str) -> str:
 def agent_page(name: str) -> str:
     """Return the page of one agent: command, docstrings of agent and parts, settings and figures."""
     preset, agent = agents.AGENTS[name], agents.agent(name)
-    text = f"# {name}\n\n{preset.says}.\n\n{_command(*agent_flags(name))}"
+    paper = f" Paper: [arXiv {PAPERS[name]}](https://arxiv.org/abs/{PAPERS[name]})." if name in PAPERS else ""
+    text = f"# {name}\n\n{preset.says}.{paper}\n\n{_command(*agent_flags(name))}"
     if preset.defaults:
         pairs = ", ".join(f"`{key}={value}`" for key, value in preset.defaults.items())
         text += f"It is `{preset.cls.__name__}` with {pairs}.\n\n"

@@ -193,6 +193,15 @@ def test_pages_of_agents_train_what_they_can_learn(hooks, teacher, name):
 
 
 @needs("mkdocs")
+def test_pages_of_agents_link_their_papers(hooks):
+    """The survey links the same ones."""
+    survey = (ROOT / "docs" / "guide" / "survey.md").read_text()
+    assert hooks.PAPERS.keys() <= AGENTS.keys()
+    assert "Paper: [arXiv 2102.06177](https://arxiv.org/abs/2102.06177)." in hooks.agent_page("care")
+    assert all(f"arxiv.org/abs/{hooks.PAPERS[name]})" in survey for name in ("care", "brc", "pcgrad", "distil", "rl2"))
+
+
+@needs("mkdocs")
 @pytest.mark.parametrize("name", ["bandit", "craft", "craft-sketched", "grid-navi", "hidden-bandit", "walker-walk"])
 def test_pages_of_families_train_an_agent_that_acts_there(hooks, teacher, name):
     check_commands(hooks.family_page(name), teacher)
