@@ -46,6 +46,7 @@ class Grid:
 
     ends_early: ClassVar[bool] = True
     reset_batches: ClassVar[int] = 16
+    cheap_starts: ClassVar[bool] = False
     finite_horizon: ClassVar[bool] = False
     width: int = 7
     height: int = 7

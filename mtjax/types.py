@@ -299,6 +299,8 @@ class Env(Protocol):
     @property
     def reset_batches(self) -> int: ...  # in how many batches all worlds are reset, where episodes end early
     @property
+    def cheap_starts(self) -> bool: ...  # whether to begin an episode costs a GPU less than to ask whether one ended
+    @property
     def finite_horizon(self) -> bool: ...  # whether the limit of time is part of the problem, so that its end is one
     def tasks(self, split: str = "train") -> Task: ...
     def task_values(self, split: str) -> Any: ...

@@ -29,7 +29,7 @@ _GPU = "takes hours without a GPU"
 _OTHER = "needs a file or a run of the reader's own"
 _HELP = "prints flags and trains nothing"
 _MANY = "trains as many agents as the points of a sweep; tests/test_sweep.py has smaller ones"
-_TRIALS = "trains sixteen agents; tests/test_search.py has smaller ones"
+_TRIALS = "trains sixteen agents or more; tests/test_search.py has smaller ones"
 _COPIES = "trains twenty agents; tests/test_populations.py has smaller ones"
 _HOSTS = "takes several processes; tests/test_devices.py has such runs"
 _FINGER = "ten fingers still have a return of 0 to 2 after 300,000 steps, which take two minutes of a CPU core"
@@ -122,6 +122,8 @@ MARKS: dict[str, Learns | str] = {
     "--population=pbt:100000 --seeds=5 --sweep agent.actor-lr=1e-4,1e-3 agent.critic-lr=1e-4,1e-3": _COPIES,
     "--quick --steps=100000 --seeds=5 --sweep agent=sac,multi-head,sac-conditioned --runs=runs/compare": _MANY,
     "--quick --search=16 --agent.actor-lr=1e-5..1e-2 --agent.gamma=0.9..0.999": _TRIALS,
+    "--env=tabular-mdp --agent=ppo --steps=49152 --seed=1 --search=32 --search-rungs=4 --agent.actor-lr=1e-5..1e-1 "
+    "--agent.critic-lr=1e-5..1e-1 --agent.entropy-cost=1e-4..1e-1 --agent.gae-lambda=0.8..0.99": _TRIALS,
     "--seeds=3 --steps=400000 --sweep env=point-mass-vary-goal,reacher-vary-goal agent=sac,multi-head": _MANY,
     "--seeds=8 --distributed --runs=/shared/runs": _HOSTS,
     "--env=pendulum-swingup --engine=mjx --seeds=2 --distributed": _HOSTS,

@@ -49,6 +49,13 @@ class Timed(Fall):
         return False
 
 
+@dataclasses.dataclass(frozen=True)
+class Cheap(Fall):
+    """The same, whose starts cost little."""
+
+    cheap_starts: ClassVar[bool] = True
+
+
 def reset(cls, ended, seed=1, shift="1,2,3", **settings):
     """Begin new episodes where worlds have ended; return them, those before, and the worlds that were reset."""
     env, agent = cls(vary={"shift": shift}, split="none", **settings), tiny("sac")
@@ -85,6 +92,26 @@ def test_some_worlds_are_reset_to_the_states_that_all_would_have(share, shift):
     np.testing.assert_array_equal(some.state[~ended], before.state[~ended])
     batch = -(-ended.size // Fall.reset_batches)
     assert count == -(-ended.sum() // batch) * batch and all_of_them == ended.size * np.any(ended)
+
+
+@pytest.mark.parametrize("shift", ["1,2,3", "1:2"])
+def test_cheap_starts_of_a_gpu_are_those_of_all_ways(shift, monkeypatch):
+    """It resets all worlds without a branch, about which the host would decide; a CPU resets those that have ended."""
+    shape = (SHAPE[0], 3 if "," in shift else 1, SHAPE[2])
+    ended = np.random.RandomState(0).uniform(size=shape) < 0.1
+    _, some, count = reset(Cheap, ended, shift=shift)
+    programs = []
+
+    def of_a_gpu(*given, cuda, default):
+        programs.append([str(jax.make_jaxpr(way)(*given)) for way in (cuda, default)])
+        return cuda(*given)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", of_a_gpu)
+    _, whole, all_of_them = reset(Cheap, ended, shift=shift)
+    jax.tree.map(np.testing.assert_array_equal, some, whole)
+    assert count < ended.size == all_of_them
+    branches = [["cond[" in program, "while[" in program] for program in programs[0]]
+    assert branches == [[False, False], [True, True]]
 
 
 def test_starts_are_fresh_and_follow_their_law():

@@ -66,6 +66,7 @@ class Family(abc.ABC):
     frames: ClassVar[int] = 1  # how many of the last pictures an agent sees at once, if it observes pictures
     ends_early: ClassVar[bool] = True  # whether episodes may end before their limit; it decides how resets are computed
     reset_batches: ClassVar[int] = 16  # in how many all worlds are reset, if they end early; more where starts are dear
+    cheap_starts: ClassVar[bool] = False  # whether to begin an episode costs a GPU less than to ask whether one ended
     films: ClassVar[bool] = False  # whether its worlds can be seen in films
     film_speed: ClassVar[float] = 1.0  # seconds of the world in a second of a film
     filmed: ClassVar[Callable[[], AbstractContextManager[None]]] = nullcontext  # a context to play filmed episodes in

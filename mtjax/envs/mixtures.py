@@ -52,6 +52,7 @@ class Mixture:
 
     ends_early: ClassVar[bool] = True  # as some family's episodes may
     reset_batches: ClassVar[int] = Family.reset_batches
+    cheap_starts: ClassVar[bool] = False
     families: Annotated[tuple[Family, ...], tyro.conf.Suppress]
     names: Annotated[tuple[str, ...], tyro.conf.Suppress]
     scenes: str = "auto"

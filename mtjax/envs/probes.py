@@ -97,6 +97,7 @@ class Probe:
 
     ends_early: ClassVar[bool] = True
     reset_batches: ClassVar[int] = 16
+    cheap_starts: ClassVar[bool] = False
     finite_horizon: ClassVar[bool] = False
     kind: str = "one-step"
     episode_length: int = LIMIT

@@ -51,6 +51,11 @@ class Stacked:
         return self.family.reset_batches
 
     @property
+    def cheap_starts(self) -> bool:
+        """Return whether to begin an episode costs a GPU less than to ask whether one ended."""
+        return self.family.cheap_starts
+
+    @property
     def finite_horizon(self) -> bool:
         """Return whether how long an episode is, is part of the problem."""
         return self.family.finite_horizon

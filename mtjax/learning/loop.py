@@ -203,7 +203,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         tasks = rows_of(known, state.rows)
     sound = jnp.all(bounded_worlds(state.worlds.obs), axis=2)
 
-    def iterate(state: TrainState, _) -> tuple[TrainState, Metrics]:
+    def iterate(state: TrainState, _) -> tuple[TrainState, tuple[_Seen, Metrics, Array]]:
         key, act_key, reset_key, learn_key = split_keys(state.key, 4)
         state, steps, seen = _collect(env, agent, settings, tasks, state, act_key, reset_key)
         observe = lambda learner, steps: at_point(agent, learner).observe(learner, steps, tasks)
@@ -213,12 +213,11 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         learners = over_seeds(observe, 0, 0)(learners, steps)
         learners = _with_played(state.agent, learners, state.rows)
         data = state.data if experience.storage.kept else ()
-        return state._replace(agent=learners, data=data, key=key), seen | {"losses": losses, "learned": learned}
+        return state._replace(agent=learners, data=data, key=key), (seen, losses, learned)
 
-    state, history = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
-    count = settings.num_envs * settings.chunk_steps
-    history["finite"] = history["finite"].at[0, 0].min(sound)
-    metrics = _summarise(history, count)
+    state, (seen, losses, learned) = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
+    seen = seen._replace(counts=seen.counts.at[0, 0, ..., 2].max(jnp.int32(~sound)))
+    metrics = _summarise(seen, losses, learned, settings.num_envs * settings.chunk_steps)
     if state.heard is not None:
         returns = collectives.of_all_seeds(metrics["return"])
         state = state._replace(heard=curricula.hear(state.heard, state.rows, returns))
@@ -321,22 +320,22 @@ def _collect(
         state, (steps, seen) = _step(env, agent, settings, tasks, state, keys, reset_keys)
         return state, jax.tree.map(lambda x: x[:, :, None], steps), jax.tree.map(lambda x: x[None], seen)
     step = lambda state, keys: _step(env, agent, settings, tasks, state, *keys)
-    apart = [jnp.stack(split_keys(each, count)) for each in (keys, reset_keys)]
+    apart = jnp.stack([jnp.stack(split_keys(each, count)) for each in (keys, reset_keys)], axis=1)  # (H, 2, S)
     if not adaptations:
-        begun, (state, steps, seen) = state.worlds.memory, _played(*jax.lax.scan(step, state, tuple(apart)))
+        begun, (state, steps, seen) = state.worlds.memory, _played(*jax.lax.scan(step, state, apart))
         whole = count == agent.unroll and not agent.experience.storage.kept
         return state, _with_first(steps, begun) if whole else steps, seen
 
     def play(state: TrainState, given: tuple) -> tuple[TrainState, tuple[Transition, Any]]:
         """Take the steps of one rollout, and adapt to them if another follows."""
-        last, *keys = given
-        state, steps, seen = _played(*jax.lax.scan(step, state, tuple(keys)))
+        last, keys = given
+        state, steps, seen = _played(*jax.lax.scan(step, state, keys))
         adapt = lambda learner, steps: at_point(agent, learner).adapt(learner, steps, tasks)
         learners = jax.lax.cond(last, lambda: state.agent, lambda: over_seeds(adapt, 0, 0)(state.agent, steps))
         return state._replace(agent=learners), (steps, seen)
 
-    apart = [x.reshape(adaptations + 1, -1, *x.shape[1:]) for x in apart]
-    state, (steps, seen) = jax.lax.scan(play, state, (jnp.arange(adaptations + 1) == adaptations, *apart))
+    apart = apart.reshape(adaptations + 1, -1, *apart.shape[1:])
+    state, (steps, seen) = jax.lax.scan(play, state, (jnp.arange(adaptations + 1) == adaptations, apart))
     joined = lambda x: jnp.moveaxis(x, 0, 2).reshape(*x.shape[1:3], count, *x.shape[4:])
     return state, jax.tree.map(joined, steps), jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), seen)
 
@@ -458,8 +457,16 @@ def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Ke
     return jax.lax.cond(due, lambda states: over_seeds(one, 0, 0)(states, keys), lambda states: states, learners)
 
 
-def _reduce_step(env_step: EnvStep, sound: Array, total: Array, counted: Array) -> dict[str, Any]:
-    """Reduce a step to the statistics for metrics, leaves (S, T).
+class _Seen(NamedTuple):
+    """Holds the statistics of a step for metrics; leaves (S, T, ...). A GPU stores each by a kernel of its own."""
+
+    counts: Array  # (S, T, 4) int32: episodes that ended and count, lost worlds, and 1 where numbers or rewards are bad
+    total: Array  # (S, T) of the returns of episodes that count
+    metrics: Metrics  # (S, T) of the environment, of these episodes' last steps
+
+
+def _reduce_step(env_step: EnvStep, sound: Array, total: Array, counted: Array) -> _Seen:
+    """Reduce a step to the statistics for metrics.
 
     Args:
         sound: (S, T, E) where no episode began with numbers out of bounds; others of that kind are lost.
@@ -467,30 +474,30 @@ def _reduce_step(env_step: EnvStep, sound: Array, total: Array, counted: Array) 
     transition = env_step.transition
     finished = transition.ended & counted & ~env_step.lost
     over_envs = lambda x: jnp.sum(jnp.where(finished, x, 0.0), axis=2)  # what is not finished may not be finite
-    return {
-        "finished": jnp.sum(finished, axis=2),
-        "lost": jnp.sum(env_step.lost, axis=2),
-        "total": over_envs(total),
-        "finite": jnp.all(sound & jnp.isfinite(transition.reward), axis=2),
-        "rewarded": jnp.all(jnp.isfinite(transition.reward), axis=2),
-        "metrics": {name: over_envs(x) for name, x in env_step.metrics.items()},
-    }
+    finite = jnp.isfinite(transition.reward)
+    bad, unrewarded = (jnp.any(~x, axis=2) for x in (sound & finite, finite))
+    counts = (jnp.sum(finished, axis=2), jnp.sum(env_step.lost, axis=2), bad, unrewarded)
+    metrics = {name: over_envs(x) for name, x in env_step.metrics.items()}
+    return _Seen(jnp.stack([jnp.int32(x) for x in counts], axis=-1), over_envs(total), metrics)
 
 
-def _summarise(history: dict, count: int) -> Metrics:
+def _summarise(seen: _Seen, losses: Any, learned: Array, count: int) -> Metrics:
     """Reduce the statistics of all steps, leaves (iterations, steps, S, ...), to one line of metrics.
 
     Args:
+        losses: the means of each iteration's updates, leaves (iterations, S, ...).
+        learned: (iterations,) whether there were updates.
         count: the steps of a task in the chunk.
     """
-    losses = history["losses"]
-    mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(history["learned"]), 1)
+    mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learned), 1)
     over_steps = lambda x: jnp.sum(x, axis=(0, 1))
-    finished, total, metrics = (jax.tree.map(over_steps, history[name]) for name in ("finished", "total", "metrics"))
-    bad, unrewarded, lost = jnp.int32(~history["finite"]), jnp.int32(~history["rewarded"]), history["lost"]
-    counts = collectives.total((finished, total, metrics, bad, unrewarded, lost))
-    episodes, total, metrics, bad, unrewarded, lost = counts
-    often = over_steps(lost) > max(_MOST_LOST * count, 1)  # a short chunk may lose a world too
+    sums = jax.tree.map(over_steps, (seen.total, seen.metrics))
+    counts, (total, metrics) = collectives.total((seen.counts, sums))
+    finished, lost, bad, unrewarded = jnp.moveaxis(counts, -1, 0)
+    episodes, often = (
+        over_steps(finished),
+        over_steps(lost) > max(_MOST_LOST * count, 1),
+    )  # a short chunk may lose one too
     bad = (bad > 0) | (often & (lost > 0))
     # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)

@@ -221,29 +221,36 @@ def reset_ended(
 
     Every episode starts in a state of its own, drawn with its world's own key. If episodes end early, at any step, only
     ended worlds are reset: some at a time, as often as it takes. If all end by their time limits, many do at once, and
-    all worlds are reset. Both give the same states.
+    all worlds are reset. A GPU, whose host decides about every branch, resets all at every step if starts are cheap.
+    All ways give the same states.
 
     Args:
         ends: what has ended with the step before, leaves (S, T, E).
-        keys: a function that returns keys (S, T, E); only the branch calls it.
+        keys: a function that returns keys (S, T, E); only a reset calls it.
 
     Returns:
         the worlds, and (S, T, E) bool, which is false where an episode begins with numbers out of bounds.
     """
     own = type(env).renew_worlds is not renew_worlds  # as it steps all of its worlds at once
     few = not own and env.ends_early and env.episode_length > 1
-    begin = partial(_reset_some if few else _reset_all, env)
+    some = partial(_reset_some if few else _reset_all, env)
     if trials.keeps_state:
-        begin = partial(_change_tasks, cast(Lasting, env))
+        some = partial(_change_tasks, cast(Lasting, env))
 
-    def renew(worlds: Worlds) -> tuple[Worlds, Array]:
+    def renew(begin: Callable[..., tuple[_Begun, Array]], worlds: Worlds) -> tuple[Worlds, Array]:
         begun, sound = begin(tasks, worlds, ends, keys(), trials)
         age = jnp.where(ends.episode, 0, worlds.age)
         memory = where_worlds(ends.trial, begin_memory(agent, learners, tasks, age), worlds.memory)
         episode = None if worlds.episode is None else jnp.where(ends.trial, 0, worlds.episode + ends.episode)
         return Worlds(*begun, memory, age, episode), sound
 
-    return jax.lax.cond(jnp.any(ends.episode), renew, lambda worlds: (worlds, jnp.ones(worlds.age.shape, bool)), worlds)
+    def branch(worlds: Worlds) -> tuple[Worlds, Array]:
+        none = lambda worlds: (worlds, jnp.ones(worlds.age.shape, bool))
+        return jax.lax.cond(jnp.any(ends.episode), partial(renew, some), none, worlds)
+
+    if trials.keeps_state or not (few and env.cheap_starts):
+        return branch(worlds)
+    return jax.lax.platform_dependent(worlds, cuda=partial(renew, partial(_reset_all, env)), default=branch)
 
 
 def followed(transition: Transition, ends: Ends, worlds: Worlds) -> Transition:

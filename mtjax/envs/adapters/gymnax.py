@@ -33,6 +33,7 @@ class Gymnax(Adapted):
     """Observe a picture (H, W, C), for convolutions, in place of a vector. The environment's own array must be one, of
     numbers from 0 to 1, as in MinAtar's games."""
 
+    cheap_starts: ClassVar[bool] = True
     suite: ClassVar[str] = "gymnax"
     package: ClassVar[str] = "gymnax"
     limit: ClassVar[str] = "max_steps_in_episode"

@@ -101,6 +101,7 @@ class Racing(Pictured, Family):
         }
     )
     asks: ClassVar[str] = "Drive a car around a closed track as fast as its tyres hold."
+    cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 600
     action_size: ClassVar[int] = 2
     step_seconds: ClassVar[float] = 0.05

@@ -94,6 +94,7 @@ class Sailing(Pictured, Family):
         }
     )
     asks: ClassVar[str] = "Sail to a mark 100 m away."
+    cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 400
     action_size: ClassVar[int] = 2
     step_seconds: ClassVar[float] = 0.5

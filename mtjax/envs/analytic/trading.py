@@ -87,6 +87,7 @@ class Trading(Pictured, Family):
         }
     )
     asks: ClassVar[str] = "Sell a million shares within five days, at little cost and little risk."
+    cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = _TRADES
     action_size: ClassVar[int] = 1
     step_seconds: ClassVar[float] = 86_400.0 * _TAU

@@ -84,6 +84,7 @@ class CartPole(Family):
             "force": Parameter("N", 10.0, minimum=-math.inf),
         }
     )
+    cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 500
     action_size: ClassVar[int] = 1
 
@@ -149,6 +150,7 @@ class Acrobot(Family):
             "torque-sign": Parameter("1", 1.0, minimum=-math.inf),
         }
     )
+    cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 500
     action_size: ClassVar[int] = 1
 
