@@ -26,8 +26,10 @@ from mkdocs.structure.files import File, Files
 from mtjax import agents, envs
 from mtjax.agents.hyperparameters import PARTS, flag_names, kinds_of, settings
 from mtjax.agents.parts import name_of
+from mtjax.agents.parts.policies import Gaussian
 from mtjax.envs.domain import Domain
 from mtjax.envs.family import Family
+from mtjax.envs.metaworld.scene import INSTALL
 from mtjax.envs.pixels import Pictured
 from mtjax.names import InputError, first_sentence
 from mtjax.report import figures
@@ -91,13 +93,22 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Name the owner's addresses where they belong."""
+    """Name the owner's addresses where they belong, and let the search rank pages by what they are."""
     known = addresses()
+    if boost := _boost(page.file.src_uri):
+        page.meta.setdefault("search", {"boost": boost})
     if known["repository"]:
         markdown = markdown.replace(_CLONE, f"git clone {known['repository']}")
     if known["doi"] and page.file.src_uri == "citing.md":
         markdown += f"\nDOI: <{known['doi']}>\n"
     return markdown
+
+
+def _boost(place: str) -> float | None:
+    """Return how much more than others a page counts in the search; None for as much."""
+    if place.startswith(("guide/", "how-to/")):
+        return 2
+    return 0.5 if place.startswith("results/") and place != "results/index.md" else None
 
 
 def on_post_page(output: str, **_: Any) -> str:
@@ -118,8 +129,12 @@ def addresses() -> dict[str, str]:
 
 def llms(config: Any, files: Files) -> str:
     """Return llms.txt, a list of all pages with what each is about, for programs that read the site."""
-    root = (config.site_url or "").rstrip("/")
-    lines = [f"# {config.site_name}", "", f"> {config.site_description}. Commands are whole and run as they stand."]
+    root = f"{config.site_url.rstrip('/')}/" if config.site_url else ""  # or else links are relative
+    lines = [
+        f"# {config.site_name}",
+        "",
+        f"> {config.site_description}. Commands are whole and run as they stand; runs/... is a run of yours.",
+    ]
     for entry in config.nav:
         ((title, inside),) = entry.items()
         lines += ["", f"## {title}", ""]
@@ -144,8 +159,8 @@ def _entry(root: str, file: Any) -> str:
     title = re.search(r"^# (.+)$", text, re.M)
     plain = re.sub(r"(?m)^[#|!<].*$", "", re.sub(r"(?s)```.*?```", "", text))
     linked = lambda link: link[1] or ""
-    says = re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", linked, first_sentence(plain.strip()))
-    return f"- [{title[1] if title else file.name}]({root}/{file.url.removeprefix('./')}): {says}"
+    says = first_sentence(re.sub(r"\[([^]]+)\]\([^)]*\)|[*`]", linked, plain.strip())).removesuffix(":")
+    return f"- [{title[1] if title else file.name}]({root + file.url.removeprefix('./') or './'}): {says}"
 
 
 # Families.
@@ -181,8 +196,11 @@ def family_page(name: str) -> str:
     """Return the page of one family: command, docstring, parameters, tasks and figures."""
     cls, _ = envs.ENVS[name]
     family = envs.make(name)
-    text = f"# {name}\n\n{_picture(name)}```bash\npython -m mtjax.train --env={name}\n```\n\n"
-    text += f"{to_markdown(cls.__doc__)}\n" + "".join(_inherited(base) for base in _described_bases(cls))
+    before = [INSTALL] if ".metaworld." in cls.__module__ else []
+    text = f"# {name}\n\n{_picture(name)}{_command(family_flags(name), *_film_flags(name), before=before)}"
+    text += f"{to_markdown(cls.__doc__)}\n"
+    for base in _described_bases(cls):
+        text += _inherited(base, text)
     if family.parameters:
         text += "\n## Parameters\n\n| parameter | unit | nominal | in this family |\n|---|---|---|---|\n"
         vary = dict(family.vary)
@@ -194,15 +212,55 @@ def family_page(name: str) -> str:
     return text + _family_settings(family)
 
 
+def _command(*lines: str, before: Iterable[str] = ()) -> str:
+    """Return commands that train, by their flags, behind those of the shell that they need."""
+    return "\n".join(["```bash", *before, *(f"python -m mtjax.train {flags}" for flags in lines), "```\n\n"])
+
+
+def family_flags(name: str) -> str:
+    """Return the flags of a command that trains a family by an agent that draws its actions."""
+    spec = envs.make(name).spec
+    if spec.action.kind == "continuous":
+        return f"--env={name}"
+    return f"--env={name} {_TRIALS.get(name) or ('--agent=sketches' if spec.symbols else '--agent=ppo')}"
+
+
+_TRIALS = {  # families whose tasks are hidden -> an agent that finds them out
+    "grid-navi": "--agent=rl2 --trials=4 --agent.unroll=60",
+    "hidden-bandit": "--agent=rl2 --trials=10 --agent.unroll=10",
+}
+
+
+def _film_flags(name: str) -> list[str]:
+    """Return the flags of the agent that a family's film shows, if it is known and not the default one."""
+    rows = [(runs, row["agent"]) for runs in _FILMED for row in _runs_of(runs, name)]
+    if not (PICTURES / f"{name}.webp").exists() or not rows:
+        return []
+    runs, agent = rows[-1]
+    known = agent in agents.AGENTS and not agents.AGENTS[agent].sees_pictures
+    flags = f"--env={name} --agent={agent}"
+    return (
+        [f"{flags}    # as in the film{', on a GPU' * (runs == _ON_GPU)}"]
+        if known and flags != family_flags(name)
+        else []
+    )
+
+
 def _described_bases(cls: type) -> list[type]:
     """Return the classes that a family is made from, up to those that all families are made from."""
     bases = takewhile(lambda base: base not in (Domain, Pictured, Family), cls.__mro__[1:])
     return [base for base in bases if base.__doc__ and base.__module__.startswith("mtjax")]
 
 
-def _inherited(base: type) -> str:
-    title = f"\n## {base.__name__} {_UNSEARCHED}\n\nThe text above says what differs from this.\n\n"
-    return f"{title}{to_markdown(base.__doc__)}\n"
+def _inherited(base: type, above: str) -> str:
+    """Return the text of a class that a family is made from. What is told above of the family counts before it."""
+    text = (
+        f"\n## {base.__name__} {_UNSEARCHED}\n\nWhat stands here holds too, unless the text above says otherwise.\n\n"
+    )
+    told = to_markdown(base.__doc__)
+    if "**Reward**: " in above:  # of which the formula above takes terms
+        told = told.replace("**Reward**: ", "**Reward in general**: ")
+    return f"{text}{told}\n"
 
 
 def _family_settings(family: Any) -> str:
@@ -282,6 +340,36 @@ def _runs_of(runs: str, name: str) -> list[dict[str, str]]:
 # Agents.
 
 
+PAPERS = {  # agents -> the numbers of their papers at arXiv, of those that are known for certain
+    "sac": "1801.01290",
+    "distral": "1707.04175",
+    "care": "2102.06177",
+    "film": "1709.07871",
+    "moore": "2311.11385",
+    "soft-modularization": "2003.13661",
+    "paco": "2210.11653",
+    "brc": "2505.23150",
+    "simba-v2": "2502.15280",
+    "xqc": "2509.25174",
+    "deepmdp": "1906.02736",
+    "hip-bmdp": "2007.07206",
+    "drq": "2107.09645",
+    "sac-ae": "1910.01741",
+    "ppo": "1707.06347",
+    "impala": "1802.01561",
+    "rl2": "1611.02779",
+    "maml": "1703.03400",
+    "pqn": "2407.04811",
+    "sketches": "1611.01796",
+    "options": "1609.05140",
+    "distil": "1511.06295",
+    "pcgrad": "2001.06782",
+    "cagrad": "2110.14048",
+    "gradnorm": "1711.02257",
+    "famo": "2306.03792",
+}
+
+
 def agents_page() -> str:
     """Return the list of all agents."""
     text = "# Agents\n\nMost agents are a choice of parts, and every agent takes every part that fits it.\n\n"
@@ -302,7 +390,8 @@ def _kind_table(kind: str) -> str:
 def agent_page(name: str) -> str:
     """Return the page of one agent: command, docstrings of agent and parts, settings and figures."""
     preset, agent = agents.AGENTS[name], agents.agent(name)
-    text = f"# {name}\n\n{preset.says}.\n\n```bash\npython -m mtjax.train --agent={name}\n```\n\n"
+    paper = f" Paper: [arXiv {PAPERS[name]}](https://arxiv.org/abs/{PAPERS[name]})." if name in PAPERS else ""
+    text = f"# {name}\n\n{preset.says}.{paper}\n\n{_command(*agent_flags(name))}"
     if preset.defaults:
         pairs = ", ".join(f"`{key}={value}`" for key, value in preset.defaults.items())
         text += f"It is `{preset.cls.__name__}` with {pairs}.\n\n"
@@ -312,6 +401,18 @@ def agent_page(name: str) -> str:
             part = getattr(agent, kind)
             text += f"\n## {kind}: {name_of(PARTS[kind], part)}\n\n{to_markdown(type(part).__doc__)}\n"
     return text + _agent_figures(name) + _settings(agent)
+
+
+def agent_flags(name: str) -> list[str]:
+    """Return the flags of commands that train by an agent, one after another, on tasks that it can learn."""
+    cls = agents.AGENTS[name].cls
+    if agents.AGENTS[name].sees_pictures:
+        return [f"--env=finger-spin-vary-size --agent={name} --env.pixels=64 --env.frames=3 --env.repeat=2"]
+    if cls.follows_sketches:
+        return [f"--env=craft-sketched --agent={name}"]
+    if cls.taught:
+        return ["--env=point-mass-vary-goal", f"--env=point-mass-vary-goal --agent={name} --from=runs/..."]
+    return [f"--agent={name}" if Gaussian in cls.policies else f"--env=bandit --agent={name}"]
 
 
 def _settings(agent: Any) -> str:

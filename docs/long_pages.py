@@ -31,7 +31,7 @@ def on_files(files: Files, config: Any) -> Files:
         for i, (name, part) in enumerate(zip(names[1:], parts[1:], strict=True), 2):
             files.append(File.generated(config, name, content=f"# {title}, {i} of {len(parts)}\n\n{part}"))
         file.content_string = _with_contents(parts, names)
-        _nest(config.nav, file.src_uri, names)
+        _nest(config.nav, file.src_uri, {name: _first(part) for name, part in zip(names[1:], parts[1:], strict=True)})
     return files
 
 
@@ -110,14 +110,18 @@ def _with_contents(parts: list[str], names: list[str]) -> str:
     return "\n".join([head.rstrip(), "", "On the pages that follow:", "", *lines, "", rest])
 
 
-def _nest(nav: list[Any], page: str, names: list[str]) -> None:
-    """Put the parts of a page behind it in the navigation."""
+def _first(part: str) -> str:
+    """Return a part's first title as plain text."""
+    return re.sub(r"[`*]|\[([^]]*)\]\([^)]*\)", r"\1", next(iter(anchors(part).values())))
+
+
+def _nest(nav: list[Any], page: str, parts: dict[str, str]) -> None:
+    """Put the parts of a page behind it in the navigation, each by its title."""
     for entry in nav:
         inside = next(iter(entry.values())) if isinstance(entry, dict) else None
         if isinstance(inside, list):
-            _nest(inside, page, names)
+            _nest(inside, page, parts)
         if isinstance(entry, dict) and inside == page:
-            (title,) = entry
             at = nav.index(entry)
-            nav[at + 1 : at + 1] = [{f"{title}, {i}": name} for i, name in enumerate(names[1:], 2)]
+            nav[at + 1 : at + 1] = [{title: name} for name, title in parts.items()]
             return

@@ -122,8 +122,9 @@ def _plain(name: Any) -> str:
 
 
 def first_sentence(text: str | None) -> str:
-    """Return the first sentence of a documentation, without its full stop."""
-    return " ".join((text or "").split("\n\n")[0].split()).split(". ")[0].removesuffix(".")
+    """Return the first sentence of a documentation, without its full stop. One goes on behind "et al."."""
+    words = " ".join((text or "").split("\n\n")[0].split())
+    return re.split(r"(?<! al)\. (?=[^a-z]|mtjax)", words, maxsplit=1)[0].removesuffix(".")
 
 
 def frozen(settings: Mapping[str, Any]) -> dict[str, Any]:

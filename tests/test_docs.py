@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,9 @@ import mtjax
 from mtjax.agents import AGENTS
 from mtjax.command.run_config import parse
 from mtjax.envs import ENVS, SUITES
+from mtjax.names import first_sentence
+from mtjax.saved.config_json import write_config
+from mtjax.training.launch import check
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -166,12 +170,104 @@ def test_pages_of_families_have_one_shape(hooks):
             assert not lacks, (name, lacks)
 
 
+def check_commands(page, teacher):
+    """Take all that a made page trains up to the check, with a run where the reader's own is meant."""
+    whole = [[word.replace("runs/...", str(teacher)) for word in each] for each in training(page)]
+    assert whole
+    for each in whole:
+        check(parse(each))
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    """A folder with the configuration of a run that can teach ten goals."""
+    write_config(folder := tmp_path_factory.mktemp("teacher"), parse(["--env=point-mass-vary-goal"]))
+    return folder
+
+
+@needs("mkdocs")
+@pytest.mark.parametrize("name", AGENTS)
+def test_pages_of_agents_train_what_they_can_learn(hooks, teacher, name):
+    """The family has the actions, pictures, sketches and teachers that the agent needs."""
+    check_commands(hooks.agent_page(name), teacher)
+
+
+@needs("mkdocs")
+def test_pages_of_agents_link_their_papers(hooks):
+    """The survey links the same ones."""
+    survey = (ROOT / "docs" / "guide" / "survey.md").read_text()
+    assert hooks.PAPERS.keys() <= AGENTS.keys()
+    assert "Paper: [arXiv 2102.06177](https://arxiv.org/abs/2102.06177)." in hooks.agent_page("care")
+    assert all(f"arxiv.org/abs/{hooks.PAPERS[name]})" in survey for name in ("care", "brc", "pcgrad", "distil", "rl2"))
+
+
+@needs("mkdocs")
+@pytest.mark.parametrize("name", ["bandit", "craft", "craft-sketched", "grid-navi", "hidden-bandit", "walker-walk"])
+def test_pages_of_families_train_an_agent_that_acts_there(hooks, teacher, name):
+    check_commands(hooks.family_page(name), teacher)
+
+
+@pytest.mark.slow
+@needs("mkdocs")
+def test_pages_of_all_families_train_an_agent_that_acts_there(hooks, teacher):
+    for name, (cls, _) in ENVS.items():
+        if cls.__module__.startswith("mtjax"):  # and not another test's own
+            check_commands(hooks.family_page(name), teacher)
+
+
 @needs("mkdocs")
 def test_pages_of_families_name_their_reward(hooks):
     """A family that changes another one shows that one's text too, up to the reward and the observation."""
     for name in ("walker-run", "cartpole-swingup", "hopper-hop-backward"):
         page = hooks.family_page(name)
         assert "**Reward**: " in page and "**Observation (" in page
+
+
+@needs("mkdocs")
+def test_a_familys_page_has_one_reward_and_what_it_needs(hooks):
+    """A formula of the class that it is made from is called general; Meta-World's scenes are installed first."""
+    page = hooks.family_page("metaworld-push")
+    assert page.count("**Reward**: ") == 1 and "**Reward in general**: Meta-World's second version" in page
+    assert "```bash\npip install --no-deps metaworld==3.1.1\npython -m mtjax.train" in page
+    assert "pip install" not in hooks.family_page("hopper-stand")
+
+
+@needs("mkdocs")
+def test_a_film_names_the_agent_that_plays(hooks):
+    """By a command of its own, unless the page's first one trains it, or one alone does not do it."""
+    shown = "python -m mtjax.train --env=walker-run --agent=brc    # as in the film, on a GPU\n"
+    assert shown in hooks.family_page("walker-run")
+    assert hooks._film_flags("dog-stand") == hooks._film_flags("metaworld-push") == []
+
+
+def test_a_first_sentence_is_whole():
+    """It goes on behind names of authors, and ends before the next one, also one that begins with the library."""
+    assert first_sentence("It follows Teh et al. 2017 here. It learns.") == "It follows Teh et al. 2017 here"
+    assert first_sentence("It is new. mtjax has it.") == "It is new"
+    assert first_sentence("See ``a.b`` and c. d here.\n\nMore.") == "See ``a.b`` and c. d here"
+
+
+def test_every_extra_is_listed():
+    listed = (ROOT / "docs" / "guide" / "install.md").read_text()
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert [name for name in extras if not re.search(rf"^\| .*`{name}`.* \|", listed, re.M)] == []
+
+
+@needs("mkdocs")
+def test_the_search_ranks_what_explains_before_tables(hooks):
+    page = lambda place: SimpleNamespace(file=SimpleNamespace(src_uri=place), meta={})
+    pages = {place: page(place) for place in ("how-to/search.md", "results/speed-2.md", "results/index.md")}
+    for each in pages.values():
+        hooks.on_page_markdown("", each)
+    ranks = [each.meta.get("search") for each in pages.values()]
+    assert ranks == [{"boost": 2}, {"boost": 0.5}, None]
+
+
+@needs("mkdocs")
+def test_parts_of_a_page_are_called_by_their_titles(long_pages):
+    nav = [{"Results": [{"Speed": "results/speed.md"}, "results/index.md"]}]
+    long_pages._nest(nav, "results/speed.md", {"results/speed-2.md": long_pages._first("## [Of](a.md) `sac`, late\n")})
+    assert nav[0]["Results"][:2] == [{"Speed": "results/speed.md"}, {"Of sac, late": "results/speed-2.md"}]
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +334,7 @@ def test_links_lead_to_the_part_that_has_their_anchor(long_pages):
 @needs("mkdocs")
 def test_addresses_stand_in_one_file(hooks, monkeypatch):
     """They reach the pages where they belong; without them nothing is said there."""
-    page = SimpleNamespace(file=SimpleNamespace(src_uri="citing.md"))
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="citing.md"), meta={})
     assert set(hooks.addresses()) == {"repository", "site", "doi"}
     known = {"repository": "https://host/me/mtjax", "site": "", "doi": "https://doi.org/1"}
     monkeypatch.setattr(hooks, "addresses", lambda: known)
@@ -277,6 +373,6 @@ def test_site_builds_without_a_broken_link(tmp_path):
     for folder, names in zip(("families", "agents"), json.loads(fresh.stdout), strict=True):  # without other tests' own
         assert all((tmp_path / folder / name / "index.html").is_file() for name in names)
     listed = (tmp_path / "llms.txt").read_text()
-    assert "# mtjax" in listed and "[Which agent](/guide/which-agent/): Begin with one of three" in listed
+    assert "# mtjax" in listed and "[Which agent](guide/which-agent/): Begin with one of three" in listed
     assert max(map(weight, tmp_path.rglob("index.html"))) < 600_000
     assert "1.65 times sac" in (tmp_path / "agents" / "care" / "index.html").read_text()

@@ -569,7 +569,7 @@ def test_train_prints_where_the_run_is_and_how_it_scored(short_family, tmp_path,
     assert [x.split()[0] for x in lines[-6:-2]] == ["split", "train", "interpolation", "extrapolation"]
     assert lines[-2].startswith("done in ") and lines[-2].endswith(f"run: {directory}")
     assert lines[-1].startswith(f"look at it: python -m mtjax.evaluate --run={directory} --import=")
-    assert lines[-1].endswith("conftest.py --video")
+    assert lines[-1].endswith("conftest.py --video    # or --view: on a page")
 
 
 @pytest.mark.slow

@@ -309,6 +309,8 @@ def test_agents_of_continuous_actions_are_refused_before_anything_is_compiled():
     """By name, with what to use instead; and an agent that was made for other actions."""
     with pytest.raises(InputError, match=r"sac draws no discrete actions, which bandit has: use ppo, .*scores"):
         mtjax.train("bandit", "sac", steps=10)
+    with pytest.raises(InputError, match="sac draws no discrete actions, which craft-sketched has: use sketches, ppo"):
+        mtjax.train("craft-sketched", "sac", steps=10)
     bandit = mtjax.make("bandit")
     with pytest.raises(InputError, match="SAC draws no discrete actions"):
         tiny("sac").init(bandit.spec, bandit.tasks(), KEY)

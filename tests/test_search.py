@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -15,6 +16,7 @@ from needs import needs
 import mtjax
 import mtjax.train
 from mtjax.command import search as command
+from mtjax.command.flags import last_given
 from mtjax.learning.evaluation import load_evaluations
 from mtjax.saved import checkpoint, survivors
 from mtjax.saved.config_json import from_json
@@ -185,6 +187,35 @@ def test_without_optuna_the_message_has_the_command(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def concluded(of_preset, of_other):
+    """The lines at the end of a search of two trials, by the returns of the preset and of the other at each rung."""
+    words = ("--steps=200000", "--env=point-mass-vary-goal", "--steps=40000")
+    trials = (Trial(0, 1, {"actor_lr": 1e-3}, {}), Trial(1, 1, {"actor_lr": 1e-2}, {}))
+    search = dataclasses.replace(EMPTY, count=2, batch=2, rungs=(100, 200), words=words, trials=trials)
+    search = searching.climb(search, [of_preset[0], of_other[0]], "run-1")
+    last = [of[1] for of in (of_preset, of_other) if len(of) == 2]
+    return "\n".join(command._conclusion(searching.climb(search, last, "run-2"), Path("here"), ()))
+
+
+def test_the_end_says_where_the_preset_was_above_the_best():
+    """It gave way early, and others were worse later. No flag of the command stands twice."""
+    above, below = concluded([37], [38, 34]), concluded([30], [38, 34])
+    assert "best at the end: trial 1, 34. the preset, trial 0: 37 after 100 steps, where it gave way" in above
+    assert "no gain over the preset is shown" in above and "no gain" not in below
+    assert "best at the end: trial 0, 39. the preset, trial 0: 39. it was" in concluded([38, 39], [37])
+    assert "mtjax.train --steps=40000 --env=point-mass-vary-goal --agent.actor-lr=0.01" in above
+
+
+def test_the_last_of_equal_flags_counts():
+    words = ["--agent.hidden", "64", "64", "--num_envs=8", "--import=a.py", "--num-envs", "4", "--import=b.py"]
+    found = ["--agent.hidden", "64", "64", "--num-envs", "4", "--import=a.py", "--import=b.py"]
+    assert last_given(words) == found
+
+
+def test_one_trial_is_not_several():
+    assert (command._trials(1), command._trials(2)) == ("1 trial", "2 trials")
+
+
 WORDS = [*SHORT_RUN, "--search=6", "--search-batch=4", "--agent.actor-lr=1e-5..1e-2", "--agent.critic-lr=1e-4..1e38"]
 
 
@@ -249,7 +280,7 @@ def test_a_killed_search_goes_on_as_it_would_have(whole, tmp_path, monkeypatch, 
     assert without(folder) == without(whole)
     before = len(calls)
     mtjax.train.main([f"--resume={folder}"])
-    assert len(calls) == before and "best: trial" in capsys.readouterr().out
+    assert len(calls) == before and "best at the end: trial" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -447,6 +447,16 @@ def test_the_page_shows_the_run(server, tmp_path, by):
     np.testing.assert_allclose([float(x) for *_, x in found], [task["scored"] for task in told["tasks"]], rtol=0.05)
 
 
+def test_a_policy_alone_has_no_empty_panels(finished_run):
+    """Only a run has curves over steps, and returns of its tasks."""
+    bare = lambda server: shown_by_node(server, then="console.log(`<${$('panels').className}>`)").splitlines()[0]
+    with serving("finger-spin-vary-size/sac-conditioned") as server:
+        page = server.page.decode()
+        assert bare(server) == "<bare>" and ".bare #curves, " in page and '<section id="curves">' in page
+    with serving(finished_run) as server:
+        assert bare(server) == "<>"
+
+
 def test_a_chosen_task_has_its_own_curve(server):
     """Of training where it was trained, else of evaluations; and its latest value is that of its row."""
     tasks = json.loads(server.numbers())["tasks"]

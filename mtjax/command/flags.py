@@ -41,6 +41,18 @@ def split_flags(argv: Sequence[str], mine: Callable[[str], bool], needed: str) -
     return given, rest
 
 
+def last_given(argv: Sequence[str]) -> list[str]:
+    """Return a command line in which each flag stands once, with the value that counts. ``--import`` may repeat."""
+    flags: dict[str, list[str]] = {}
+    flag = ""
+    for word in argv:
+        if word.startswith("--"):
+            flag = word if word.startswith("--import") else word.partition("=")[0].replace("_", "-")
+            flags[flag] = []
+        flags.setdefault(flag, []).append(word)
+    return [word for words in flags.values() for word in words]
+
+
 def vary_flags(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Take --env.vary.NAME=VALUES out of a command line, because only the family knows the names."""
     needed = "values; give lo:hi:n, lo:hi or a list a,b,c"

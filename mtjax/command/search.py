@@ -18,7 +18,7 @@ import numpy as np
 from mtjax.agents import swept
 from mtjax.agents.hyperparameters import flag_names
 from mtjax.checks import amount, require_library
-from mtjax.command.flags import flag_value, split_flags
+from mtjax.command.flags import flag_value, last_given, split_flags
 from mtjax.command.run_config import draft, parse
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import RunConfig
@@ -173,7 +173,7 @@ def _fitting(config: RunConfig, search: Search) -> Search:
     largest = min(len(part.points) for part in memory.split_to_fit(many, memory.available_bytes()))
     if largest == search.batch:
         return search
-    print(f"{largest} trials fit into memory together, so a round has no more", flush=True)
+    print(f"memory holds {_trials(largest)} at a time, so a round has no more", flush=True)
     config, rungs = _with_rungs(config, largest, len(search.rungs))
     return dataclasses.replace(search, batch=largest, rungs=rungs)
 
@@ -209,6 +209,10 @@ def _describe(search: Search) -> str:
     )
 
 
+def _trials(count: int) -> str:
+    return f"{count} trial{'s' * (count != 1)}"
+
+
 def _climb(folder: Path, config: RunConfig, search: Search) -> Search:
     """Train the running trials up to their next rung, and return the search after it."""
     run, parent = (folder / f"run-{_run_number(search) - i}" for i in (0, 1))
@@ -219,7 +223,7 @@ def _climb(folder: Path, config: RunConfig, search: Search) -> Search:
         run.mkdir(exist_ok=True)
         write_config(run, now)
     end, checkpoints = search.rungs[rung], run / "checkpoints"
-    label = f"round {search.round}, rung {rung + 1} of {len(search.rungs)}: {len(search.running)} trials"
+    label = f"round {search.round}, rung {rung + 1} of {len(search.rungs)}: {_trials(len(search.running))}"
     newest = checkpoint.newest(checkpoints)
     if newest is None or int(newest.name) * now.worlds < end:
         try:
@@ -276,13 +280,27 @@ def _conclusion(search: Search, folder: Path, imports: Sequence[str]) -> list[st
     if best is None:
         return [f"no trial finished; all diverged. search: {folder}"]
     flags = [f"--agent.{name.replace('_', '-')}={x:g}" for name, x in best.values.items()]
-    again = shlex.join(["python", "-m", "mtjax.train", *search.words, *flags])
+    again = shlex.join(["python", "-m", "mtjax.train", *last_given([*search.words, *flags])])
     point = ["python", "-m", "mtjax.evaluate", f"--run={folder / best.run}", *imports, f"--point={best.point}"]
     told = "it was chosen by its returns, which therefore look too good: train it with other seeds"
     with contextlib.suppress(StopIteration):
-        first = next(trial for trial in search.trials if trial.values == search.preset)
-        told = f"the preset, trial {first.number}: {amount(searching.last_return(first))}, {first.state}. {told}"
+        told = f"{_beside(next(trial for trial in search.trials if trial.values == search.preset), best)}. {told}"
     whole, share = len(search.trials) * search.rungs[-1], searching.taken(search)
     steps = f"trials took {share:,} steps a seed, {share / whole:.0%} of the {whole:,} that all to the end take"
-    chosen = [f"best: trial {best.number}. {told}", f"  {again}", f"score it: {shlex.join(point)}"]
+    value = amount(searching.last_return(best))
+    chosen = [f"best at the end: trial {best.number}, {value}. {told}", f"  {again}", f"score it: {shlex.join(point)}"]
     return [steps, *chosen, f"search: {folder}"]
+
+
+def _beside(preset: Trial, best: Trial) -> str:
+    """Return how the preset did, and whether the best trial at the end was below it."""
+    told = f"the preset, trial {preset.number}: {amount(searching.last_return(preset))}"
+    if preset.state == searching.GAVE_WAY:
+        told += f" after {list(preset.returns)[-1]:,} steps, where it gave way"
+    elif preset is not best:
+        told += f", {preset.state}"
+    if searching.last_return(preset) <= searching.last_return(best):
+        return told
+    return (
+        f"{told}. That is above trial {best.number}: no gain over the preset is shown; --search-rungs=1 ends none early"
+    )

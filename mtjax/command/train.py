@@ -91,5 +91,6 @@ def _conclude(config: RunConfig, result: Result, directory: Path) -> None:
     words = [f"--run={directory}", *import_flags(config)]
     if config.plan.rule and len(result.evaluations.steps):
         words += [f"--point={populations.best(result.evaluations.returns['train'][:, -1])}"]
-    words += ["--video"] * any(part.family.films for part in config.family.parts)
-    print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}")
+    films = any(part.family.films for part in config.family.parts)
+    words += ["--video"] * films
+    print(f"look at it: python -m mtjax.evaluate {shlex.join(words)}{'    # or --view: on a page' * films}")

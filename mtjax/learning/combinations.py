@@ -61,12 +61,14 @@ def require_env(settings: Settings, env: Env, agent: Agent) -> None:
 
 def _draws_none(env: Env, agent: BaseAgent) -> InputError:
     """Return the error of an agent that cannot draw a family's actions. It names some agents that can."""
-    draws = lambda cls: isinstance(agent.policy, cls.policies) and not (cls.taught or cls.follows_sketches)
-    able = ", ".join([name for name, preset in AGENTS.items() if draws(preset.cls)][:3])
+    draws = lambda cls: isinstance(agent.policy, cls.policies) and not cls.taught
+    able = [name for name, preset in AGENTS.items() if draws(preset.cls) and not preset.cls.follows_sketches][:3]
+    if env.spec.symbols:
+        able = [name for name, preset in AGENTS.items() if draws(preset.cls) and preset.cls.follows_sketches] + able
     families = [part.family for part in env.parts] if isinstance(env, FamilyOrMixture) else []
     scores = ", or --env.scores" * any(isinstance(family, Choosing) for family in families)
     names, kind = (agent_name_of(agent), env_name_of(env)), env.spec.action.kind
-    return InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {able}{scores}")
+    return InputError(f"{names[0]} draws no {kind} actions, which {names[1]} has: use {', '.join(able)}{scores}")
 
 
 def _require_windows(num_envs: int, agent: Agent) -> None:
