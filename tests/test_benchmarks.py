@@ -773,6 +773,14 @@ def test_wrong_input_ends_every_benchmark_with_one_line():
     assert len(commands) > 25 and not [name for name, text in commands.items() if "    run_main(main)\n" not in text]
 
 
+def test_a_policy_that_is_shown_no_parameter_has_no_return_with_these_limited(script):
+    """Though it is tried on tasks beyond the range, as brc is, which knows tasks by embeddings."""
+    config = mtjax.preset("walker-run-vary-friction", "brc", "gpu")
+    assert len(config.family.tasks("extrapolation").id)
+    given = SimpleNamespace(seed=0, seeds=1, eval_episodes=1)
+    assert script("returns").limited(config.family, config.learner, None, given) is None
+
+
 def test_settings_are_words_with_an_equals_sign(script):
     """What is behind it is read as JSON if it is some."""
     settings_of, found = script("report").settings_of, {"hidden": (8, 8), "tau": 0.1, "engine": "c", "arguments": "a=b"}

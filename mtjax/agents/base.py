@@ -255,6 +255,7 @@ class BaseAgent(abc.ABC):
         combinations.require_sight(self, spec)
         combinations.require_policy(self, spec)
         view, num_tasks, own = self.view, len(tasks.id), combinations.disjoint(self)
+        self.encoder.require(num_tasks)
         inputs, action = init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         vectors, seen = self.conditioning.table(spec, num_tasks), view.example(spec, inputs)
         first = jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))

@@ -16,7 +16,6 @@ from mtjax.agents.parts.knowing import Knowing
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
 from mtjax.experience.rollouts import windows
-from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 
@@ -107,8 +106,6 @@ class MAML(OnPolicy):
 
     def adapt(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
         """Take an inner step for each task, given a rollout (T, H, E, ...) of its policy."""
-        if collectives.count() > 1:
-            raise InputError("maml needs all environments of a seed on one device; use no more devices than seeds")
         _, steps = self.assess(state, steps, tasks)
         _, batch = self.prepare(state, windows(steps, 0), tasks)
         of_task = lambda nets, batch: self.step_inside(nets, nets["adapted"], batch, Played.of(batch, 1))
