@@ -116,8 +116,6 @@ class BaseAgent(abc.ABC):
     """Whether it goes on with what it chose in earlier steps of the episode, which its memory holds."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
-    least_loss: ClassVar[float] = 0.0
-    """Lower bound of the critics' loss of a task, without what the representation adds."""
     target: ClassVar[Target] = Target()
     """What the critics are fitted to, in agents with a replay."""
     continual: ClassVar[Continual] = Continual()

@@ -119,8 +119,11 @@ def descend(
 
 
 def above_least(agent: Any, loss: Callable) -> Callable:
-    """Subtract its lower bound from the critics' loss of one task, for rules of surgery that compare losses."""
-    least = agent.least_loss + agent.representation.least_loss
+    """Subtract its lower bound from the critics' loss of one task, for rules of surgery that compare losses.
+
+    Only a representation has one other than 0.
+    """
+    least = agent.representation.least_loss
 
     def excess(nets: Nets, *data: Any) -> tuple[Array, Any]:
         value, aux = loss(nets, *data)
