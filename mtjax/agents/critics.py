@@ -123,8 +123,6 @@ def over_rollout(function: Any, agent: Any, state: AgentState, features: Array, 
 def renew(agent: Any, state: AgentState, target: Array) -> tuple[AgentState, Units]:
     """Move the critic's units by targets (T, ...), and with PopArt rescale its heads to them."""
     target, old = target.reshape(len(target), -1), Units.of(state)
-    scaling, _ = agent.scaling.renew(state.nets["scaling"].own, target, ())
-    state = state.with_nets(scaling=Params({}, scaling))
     if agent.value_normalization == "none":
         return state, old
     new = old.moved(target, agent.value_rate)

@@ -38,7 +38,7 @@ class NoScaling:
         return factor * (batch.reward - (1 - gamma * batch.discount) * offset)
 
     def renew(self, memory: Any, target: Array, critics: tuple[Params, ...]) -> tuple[Any, tuple[Params, ...]]:
-        """Update the memory by the targets (T, B) of an update, and rescale the critics to the new units."""
+        """Update the memory by the targets (T, B) of an update from a replay, and rescale critics to the new units."""
         return memory, critics
 
     def reset(self, memory: Any) -> Any:
