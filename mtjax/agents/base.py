@@ -322,7 +322,7 @@ class BaseAgent(abc.ABC):
         """Take one gradient step on windows (T, B, L, ...) of the training tasks; metrics are (T,).
 
         Args:
-            number: () how many updates came before.
+            number: () of the update, from the end of the first warm-up on; those that a later one leaves out count too.
         """
 
     def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:

@@ -84,7 +84,7 @@ class Units(NamedTuple):
 
 
 def models(agent: Any, state: AgentState, flat: Transition, tasks: Task, next_obs: Any) -> dict[str, Any]:
-    """Return what a batch holds for a representation that learns."""
+    """Return what a representation that learns needs in a batch: actions, rewards and next observations, by name."""
     if not agent.representation.learns:
         return {}
     return {

@@ -70,7 +70,7 @@ class MAML(OnPolicy):
     gae_lambda: float = 1.0
     """Lambda of advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
     entropy_cost: float = 0.0
-    """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
+    """Weight of the entropy in the actor loss (c), in standard deviations of advantages, or of reward without these."""
     clip_range: float = 0.2
     """Clip the ratio of policies to this distance from 1 (epsilon)."""
     advantage_normalization: clipped_ratio.Normalization = "task"

@@ -102,7 +102,7 @@ def _require_turns(settings: Settings, agent: Agent) -> None:
 
 def _require_way_back(settings: Settings, env: Any) -> None:
     """Refuse a curriculum that asks worlds to go back to their start, where they are reset or have no task for it."""
-    if not settings.plays.returns:
+    if not settings.plays.goes_back:
         return
     told = f"the curriculum {settings.curriculum}"
     if not settings.reset_free:
