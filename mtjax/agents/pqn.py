@@ -157,9 +157,8 @@ class PQN(BaseAgent):
         """Take a gradient step on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
         batch = self.view.keyed(self.batch(state, window, tasks), jax.random.fold_in(key, 1))
         state, fitted = descend(self.fits, "critic", state, self.loss, (batch,), key)
-        return state, fitted.aux | fitted.metrics | {
-            "epsilon": jnp.broadcast_to(self.exploration(state), len(tasks.id))
-        }
+        epsilon = {"epsilon": jnp.broadcast_to(self.exploration(state), len(tasks.id))}
+        return state, fitted.aux | fitted.metrics | epsilon
 
     def batch(self, state: AgentState, window: Transition, tasks: Task) -> Batch:
         """Return the batch (T, ...) for the loss, of windows (T, B, L, ...) with their targets."""
