@@ -21,7 +21,6 @@ stopped goes on from ``OUT/WAY.run`` if the same command is given again.
 
 import argparse
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -122,14 +121,11 @@ def by_episode(arguments: argparse.Namespace, result: Result) -> dict[str, Any]:
 
 
 def table(out: Path) -> str:
-    """Return what all ways that have finished earn by split, and write it as ``OUT/table.md``."""
-    paths = {way: out / f"{way}.json" for way in WAYS}
-    found = {way: json.loads(path.read_text()) for way, path in paths.items() if path.exists()}
+    """Return what all ways that have finished earn by split."""
+    found = parts.results_of(out, WAYS)
     count = max((len(result["returns"]["train"][0]) for result in found.values()), default=1)
     titles = ["way", "split", *(f"after {k}" for k in range(count)), "training s"]
-    text = markdown(titles, [line for way in found for line in lines(way, found[way])])
-    (out / "table.md").write_text(text + "\n")
-    return text
+    return markdown(titles, [line for way in found for line in lines(way, found[way])])
 
 
 def lines(way: str, result: dict[str, Any]) -> list[list[str]]:

@@ -55,8 +55,7 @@ def main() -> None:
         return measure(arguments)
     todo = [part(arguments, i, rungs) for i in range(arguments.searches) for rungs in (1, arguments.rungs)]
     left = parts.run_parts(__file__, todo, arguments.out, arguments)
-    print(table(arguments.out, arguments.rungs))
-    parts.require_all(left)
+    parts.end(table(arguments.out, arguments.rungs), arguments.out, left)
 
 
 def part(arguments: argparse.Namespace, number: int, rungs: int) -> parts.Part:
@@ -105,9 +104,7 @@ def table(out: Path, rungs: int) -> str:
     titles = ["search", "best of all", "found by halving", "its rank", "share of steps", "seconds, all", "halving"]
     rows = [[str(i), *(f"{x:.4g}" for x in line)] for i, line in enumerate(found)]
     means = [f"{stats.seed_interval(np.array(column)):.4g}" for column in zip(*found, strict=True)]
-    text = markdown(titles, rows + ([["mean", *means]] if found else []))
-    (out / "table.md").write_text(text + "\n")
-    return text
+    return markdown(titles, rows + ([["mean", *means]] if found else []))
 
 
 def compared(whole: dict[str, Any], halved: dict[str, Any]) -> list[float]:

@@ -19,7 +19,6 @@ over seeds, and the paired difference of areas from ``none`` and from ``uniform`
 """
 
 import argparse
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -81,14 +80,11 @@ def measure(arguments: argparse.Namespace, way: str) -> None:
 
 
 def table(out: Path) -> str:
-    """Return the returns of all ways that have finished, and write them as ``OUT/table.md``."""
-    paths = {way: out / f"{way}.json" for way in WAYS}
-    found = {way: json.loads(path.read_text()) for way, path in paths.items() if path.exists()}
+    """Return the returns of all ways that have finished."""
+    found = parts.results_of(out, WAYS)
     areas = {way: np.array(result["returns"]).mean(axis=1) for way, result in found.items()}
     titles = ["way", "last return", "mean return", "less none's", "less uniform's", "training s"]
-    text = markdown(titles, [row(way, found[way], areas) for way in found])
-    (out / "table.md").write_text(text + "\n")
-    return text
+    return markdown(titles, [row(way, found[way], areas) for way in found])
 
 
 def row(way: str, result: dict[str, Any], areas: dict[str, np.ndarray]) -> list[str]:

@@ -1,12 +1,12 @@
 """Measure returns and the cost of a step on ten tasks of dm_control with ten models in one program.
 
-    python benchmarks/mixture.py [--agents NAME ...] [--alone NAME ...] [--steps N] [--minutes 8] [--out DIR]
+    python benchmarks/mixture.py [--ways cost agent-care alone-finger-spin ...] [--steps N] [--seeds 1]
+                                 [--within SECONDS] [--devices 0 ...] [--out DIR]
 
-Parts are the agents on the mixture, each task alone (by sac-conditioned, which is then plain SAC, with the same
-preset, steps, environments and updates per task) and the cost of a step. Each part writes a file into DIR, and finished
-parts are not run again. After ``--minutes`` no further part begins; the same command continues with the rest. Several
-processes may run other parts in the same DIR, if times do not matter. All results in DIR together give ``returns.csv``,
-``table.md`` and ``mixture.json``.
+Ways are the cost of a step (``cost``), agents on the mixture (``agent-NAME``) and a task alone (``alone-NAME``) by
+sac-conditioned, which is then plain SAC, with the same preset, steps, environments and updates per task. Every way is a
+process of its own, and writes ``OUT/WAY.json``. Finished ways are not run again. All results in DIR together give
+``table.md``. Times hold only where a way has the machine to itself.
 
 A return is the mean of the last evaluation under the mean action, over episodes and seeds. ``disjoint`` is one SAC for
 every task inside the mixture: beside "alone" it shows that padding and masks lose nothing. The cost is the median time
@@ -14,18 +14,15 @@ of a step of every world, without resets, by random actions; a family alone has 
 """
 
 import argparse
-import csv
-import json
 import statistics
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from parts import whole
+import parts
 from report import markdown, record, run_main, settings_of
 
 import mtjax
@@ -51,10 +48,11 @@ _ROUNDS = 5
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", default=TASKS, metavar="NAME")
-    parser.add_argument("--agents", nargs="*", default=AGENTS, choices=list(mtjax.AGENTS), metavar="NAME")
-    parser.add_argument("--alone", nargs="*", metavar="NAME", help="tasks to learn alone; by default all")
-    parser.add_argument("--steps", type=whole, default=1_000_000, help="environment steps of each task")
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="NAME")
+    parser.add_argument(
+        "--ways", nargs="+", metavar="WAY", help="by default all, with these agents: " + ", ".join(AGENTS)
+    )
+    parser.add_argument("--steps", type=parts.whole, default=1_000_000, help="environment steps of each task")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--num-envs", type=int, default=512, help="environments of each task")
     parser.add_argument("--updates-per-step", type=int, default=16)
@@ -62,38 +60,27 @@ def main() -> None:
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--training", nargs="*", default=[], metavar="NAME=VALUE", help="such as replay_size=100000")
-    parser.add_argument("--timed-steps", type=int, default=100, help="steps in a timed call; 0 leaves the cost out")
-    parser.add_argument("--minutes", type=float, default=8.0, help="after which no further part begins")
+    parser.add_argument("--timed-steps", type=int, default=100, help="steps in a timed call")
     parser.add_argument("--out", type=Path, default=Path("runs") / "mixture")
+    parts.add_flags(parser)
     arguments = parser.parse_args()
+    alone = [f"alone-{task}" for task in arguments.tasks]
+    arguments.ways = arguments.ways or ["cost", *(f"agent-{agent}" for agent in AGENTS), *alone]
+    parts.run_ways(__file__, arguments, measure, lambda out: table(out, arguments.tasks))
+
+
+def measure(arguments: argparse.Namespace, way: str) -> None:
+    """Run a way, and write its figures."""
     enable_compile_cache()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    started = time.monotonic()
-    left = []
-    for name, run in parts(arguments):
-        file = arguments.out / f"{name}.json"
-        if file.exists():
-            continue
-        if time.monotonic() - started > 60 * arguments.minutes:
-            left.append(name)
-            continue
-        print(name, flush=True)
-        file.write_text(json.dumps(record(arguments, run()), indent=1, default=str) + "\n")
-        summarise(arguments)
-    print(summarise(arguments))
-    if left:
-        print(f"not begun: {', '.join(left)}; the same command goes on with them")
-
-
-def parts(arguments: argparse.Namespace) -> Iterator[tuple[str, Any]]:
-    """Return every part's name and the function that runs it."""
-    if arguments.timed_steps:
-        yield "cost", lambda: cost(arguments)
-    everything = "+".join(arguments.tasks)
-    for agent in arguments.agents:
-        yield f"agent-{agent}", lambda agent=agent: learn(arguments, everything, agent)
-    for task in arguments.tasks if arguments.alone is None else arguments.alone:
-        yield f"alone-{task}", lambda task=task: learn(arguments, task, "sac-conditioned")
+    kind, _, name = way.partition("-")
+    match kind:
+        case "cost":
+            figures = cost(arguments)
+        case "agent":
+            figures = learn(arguments, "+".join(arguments.tasks), name)
+        case _:
+            figures = learn(arguments, name, "sac-conditioned")
+    parts.write_result(arguments.out / f"{way}.json", record(arguments, figures))
 
 
 # What is learned.
@@ -204,39 +191,25 @@ class Stepper:
 # Reporting.
 
 
-def summarise(arguments: argparse.Namespace) -> str:
-    """Print all finished parts, and write the files that join them."""
-    found = {file.stem: json.loads(file.read_text()) for file in sorted(arguments.out.glob("*-*.json"))}
-    alone = {name: part for part in found.values() if len(part["tasks"]) == 1 for name in part["tasks"]}
-    agents = {name.removeprefix("agent-"): part for name, part in found.items() if name.startswith("agent-")}
-    last = lambda part, task: float(np.mean(part["returns"][task], axis=0)[-1])
-    score = lambda part, task: last(part, task) if part is not None and task in part["returns"] else None
-    columns = {"alone": {task: score(alone.get(task), task) for task in arguments.tasks}}
-    columns |= {name: {task: score(part, task) for task in arguments.tasks} for name, part in agents.items()}
-    rows = [{"task": task, **{name: column[task] for name, column in columns.items()}} for task in arguments.tasks]
-    with (arguments.out / "returns.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["task", *columns])
-        writer.writeheader()
-        writer.writerows(rows)
-    cell = lambda x: "-" if x is None else f"{x:.0f}"
-    lines = [[row["task"], *(cell(row[name]) for name in columns)] for row in rows]
-    known = {name: [x for x in column.values() if x is not None] for name, column in columns.items()}
-    means = {name: float(np.mean(x)) if len(x) == len(rows) else None for name, x in known.items()}
-    lines.append(["mean", *(cell(means[name]) for name in columns)])
-    lines.append(["seconds", "-", *(f"{part['seconds']:.0f}" for part in agents.values())])
-    lines.append(["compile seconds", "-", *(f"{part['compile_seconds']:.0f}" for part in agents.values())])
-    text = markdown(["task", *columns], lines)
-    file = arguments.out / "cost.json"
-    price = json.loads(file.read_text()) if file.exists() else None
-    if price is not None:
-        each = [[name, price["engines"][name], f"{x:.2f}"] for name, x in price["milliseconds"].items()]
-        each += [["sum", "", f"{price['sum']:.2f}"], ["mixture", "", f"{price['mixture']:.2f}"]]
-        text += "\n\n" + markdown(["family", "engine", "ms a step of all its worlds"], each)
-        text += f"\n\nThe mixture's step takes {price['ratio']:.2f} of the sum of its parts."
-    (arguments.out / "table.md").write_text(text + "\n")
-    report = record(arguments, {"returns": rows, "parts": found, "cost": price})
-    (arguments.out / "mixture.json").write_text(json.dumps(report, indent=1, default=str) + "\n")
-    return text
+def table(out: Path, tasks: list[str]) -> str:
+    """Return the last returns by task of all ways that have finished, and what a step costs."""
+    found = parts.results_of(out, sorted(path.stem for path in out.glob("*.json")))
+    agents = {name.removeprefix("agent-"): x for name, x in found.items() if name.startswith("agent-")}
+    alone = {task: found[f"alone-{task}"]["returns"][task] for task in tasks if f"alone-{task}" in found}
+    returns = {"alone": alone} | {name: x["returns"] for name, x in agents.items()}  # (S, V) of each task
+    last = {name: {task: np.mean(x[task], axis=0)[-1] for task in tasks if task in x} for name, x in returns.items()}
+    lines = [[task, *(f"{x[task]:.0f}" if task in x else "-" for x in last.values())] for task in tasks]
+    lines.append(["mean", *(f"{np.mean([*x.values()]):.0f}" if len(x) == len(tasks) else "-" for x in last.values())])
+    for clock in ("seconds", "compile_seconds"):
+        lines.append([clock.replace("_", " "), "-", *(f"{x[clock]:.0f}" for x in agents.values())])
+    text = markdown(["task", *last], lines)
+    if "cost" not in found:
+        return text
+    price = found["cost"]
+    each = [[name, price["engines"][name], f"{x:.2f}"] for name, x in price["milliseconds"].items()]
+    each += [["sum", "", f"{price['sum']:.2f}"], ["mixture", "", f"{price['mixture']:.2f}"]]
+    text += "\n\n" + markdown(["family", "engine", "ms a step of all its worlds"], each)
+    return text + f"\n\nThe mixture's step takes {price['ratio']:.2f} of the sum of its parts."
 
 
 if __name__ == "__main__":

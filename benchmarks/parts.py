@@ -65,7 +65,7 @@ def run_ways(
     table: Callable[[Path], str],
     last: Collection[str] = (),
 ) -> None:
-    """Measure a way if this process is its part. Else run all ways that have no result yet, and print the table.
+    """Measure a way if this process is its part. Else run all ways that have no result yet, and write the table.
 
     Args:
         arguments: ``ways``, those of ``add_flags``, and others, which every part is given too.
@@ -77,8 +77,7 @@ def run_ways(
     for late in (False, True):
         ways = [way for way in arguments.ways if (way in last) == late]
         left = left or run_parts(script, [_of_way(arguments, way) for way in ways], arguments.out, arguments)
-    print(table(arguments.out))
-    require_all(left)
+    end(table(arguments.out), arguments.out, left)
 
 
 def run_pairs(
@@ -88,7 +87,7 @@ def run_pairs(
     play: Callable[..., None],
     table: Callable[[Path], str],
 ) -> None:
-    """Play a pair if ``--part`` names it. Else run all that have no result yet, and print the table.
+    """Play a pair if ``--part`` names it. Else run all that have no result yet, and write the table.
 
     Args:
         pairs: of two words each, whose parts are given all flags of this call too.
@@ -99,8 +98,7 @@ def run_pairs(
     words = lambda pair: [*sys.argv[1:], "--out", str(arguments.out), "--part", *map(str, pair)]
     named = [Part("-".join(map(str, pair)), words(pair)) for pair in pairs]
     left = run_parts(script, named, arguments.out, arguments)
-    print(table(arguments.out))
-    require_all(left)
+    end(table(arguments.out), arguments.out, left)
 
 
 def _of_way(arguments: argparse.Namespace, way: str) -> Part:
@@ -205,6 +203,13 @@ def _wait(process: subprocess.Popen, end: float) -> None:
     process.wait()
 
 
+def end(table: str, out: Path, left: list[str]) -> None:
+    """Print the table of the results in a folder, and write it there. End the program if some parts have no result."""
+    print(table)
+    (out / "table.md").write_text(table + "\n")
+    require_all(left)
+
+
 def require_all(left: list[str]) -> None:
     """End the program if some parts have no result."""
     if left:
@@ -231,6 +236,12 @@ def write_result(path: Path, result: Mapping[str, Any]) -> None:
     new = path.with_suffix(".new")
     new.write_text(json.dumps(result, indent=1, default=str) + "\n")
     new.replace(path)
+
+
+def results_of(out: Path, ways: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Return the results of those ways that have finished, by way."""
+    files = {way: out / f"{way}.json" for way in ways}
+    return {way: json.loads(file.read_text()) for way, file in files.items() if file.exists()}
 
 
 def read_results(out: Path) -> Iterator[dict[str, Any]]:

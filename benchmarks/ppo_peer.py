@@ -87,8 +87,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as caches:
         of_all = [part(env, side, seed, Path(caches), arguments.out) for env, side, seed in every]
         left = parts.run_parts(__file__, of_all, arguments.out, arguments)
-    print(tabulate(arguments.out, arguments.marks))
-    parts.require_all(left)
+    parts.end(tabulate(arguments.out, arguments.marks), arguments.out, left)
 
 
 def part(env: str, side: str, seed: int, caches: Path, out: Path) -> parts.Part:
@@ -252,7 +251,7 @@ def show(side: str, point: Reached) -> None:
 
 
 def tabulate(out: Path, marks: list[float]) -> str:
-    """Write the tables of all results, and return that of times."""
+    """Return the table of times of all results, and write that of settings."""
     found: dict[tuple[str, str], list[dict]] = {}
     for result in parts.read_results(out):
         found.setdefault((result["env"], result["side"]), []).append(result)
@@ -267,7 +266,6 @@ def tabulate(out: Path, marks: list[float]) -> str:
 
 {_SHARE:.0%} of the best is of the side with the highest mean over seeds of their best evaluations: {of_best}. Times are
 medians over seeds, with the least and the largest. "-": not every seed reached the return."""
-    (out / "table.md").write_text(table + "\n")
     names = ["worlds", "passes", "samples_per_gradient_step", "substeps", "substep_seconds", "engine", "imported_after"]
     rows = [[*key, *(f"{x[0]['choices'][name]}" for name in names)] for key, x in found.items()]
     (out / "settings.md").write_text(markdown(["task", "side", *(x.replace("_", " ") for x in names)], rows) + "\n")

@@ -140,7 +140,7 @@ def ours(arguments: argparse.Namespace, game: str, pictures: bool) -> dict[str, 
 
 
 def tabulate(out: Path) -> str:
-    """Write a table of all results, a line for each game and side, and return it."""
+    """Return the table of all results, a line for each game and side."""
     from mtjax.report.stats import seed_interval
 
     lines = []
@@ -151,9 +151,7 @@ def tabulate(out: Path) -> str:
         count, steps = str(len(scores)), f"{result['steps']:,}"
         lines.append([result["game"], result["side"], count, steps, *cells, f"{result['compile_seconds']:.0f}"])
     head = ["game", "side", "seeds", "steps", "score", "range of seeds", "seconds", "compiling, s"]
-    table = markdown(head, sorted(lines))
-    (out / "table.md").write_text(table + "\n")
-    return table
+    return markdown(head, sorted(lines))
 
 
 if __name__ == "__main__":

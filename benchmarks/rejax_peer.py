@@ -116,7 +116,7 @@ def ours(steps: int, seeds: int, side: str) -> dict[str, Any]:
 
 
 def tabulate(out: Path) -> str:
-    """Write and return the table of all results, by the number of seeds."""
+    """Return the table of all results, by the number of seeds."""
     import numpy as np
 
     lines = []
@@ -138,9 +138,7 @@ def tabulate(out: Path) -> str:
         "run s",
         "run s a seed",
     ]
-    table = markdown([*head, "env-steps/s, all seeds", "gradient steps a million steps"], lines)
-    (out / "table.md").write_text(table + "\n")
-    return table
+    return markdown([*head, "env-steps/s, all seeds", "gradient steps a million steps"], lines)
 
 
 if __name__ == "__main__":

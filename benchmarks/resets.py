@@ -15,7 +15,6 @@ The table has success at the end of an episode, as the mean over all evaluations
 """
 
 import argparse
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -87,8 +86,7 @@ def measure(arguments: argparse.Namespace, way: str) -> None:
 
 def table(out: Path) -> str:
     """Return the success of all ways that have finished."""
-    files = [out / f"{way}.json" for way in WAYS]
-    found = {result["way"]: result for result in (json.loads(file.read_text()) for file in files if file.exists())}
+    found = parts.results_of(out, WAYS)
     titles = ["way", "success, mean over training", "success, last evaluation", "mean less naive's", "seconds"]
     return markdown(titles, [row(found, way) for way in found])
 

@@ -127,9 +127,9 @@ def learn(arguments: argparse.Namespace, family: str) -> None:
 
 
 def limited(family: FamilyOrMixture, agent: Agent, result: Result, arguments: argparse.Namespace) -> float | None:
-    """Return the mean return of extrapolation with ``context_limit=1``."""
+    """Return the mean return of extrapolation with ``context_limit=1``; None without, or if no parameter is shown."""
     tasks, seeds = family.tasks("extrapolation"), arguments.seed + jnp.arange(arguments.seeds)
-    if not len(tasks.id):
+    if not len(tasks.id) or not agent.conditioning.by_parameters:
         return None
     agent = replace(agent, {"context_limit": 1.0})
     episodes = Episodes(arguments.eval_episodes)

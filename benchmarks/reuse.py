@@ -20,7 +20,6 @@ under the curve.
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,7 +72,7 @@ def main() -> None:
     for runs in (TAUGHT, WAYS):
         left = parts.run_parts(__file__, [part(arguments, run) for run in runs], arguments.out, arguments)
         parts.require_all(left)
-    print(table(arguments.out))
+    parts.end(table(arguments.out), arguments.out, left)
 
 
 def part(arguments: argparse.Namespace, run: str) -> parts.Part:
@@ -102,7 +101,7 @@ def measure(arguments: argparse.Namespace, run: str) -> None:
 
 def table(out: Path) -> str:
     """Return the returns of each way, with intervals over seeds, and what it gains on average over ``scratch``."""
-    found = {way: np.array(json.loads((out / f"{way}.json").read_text())["returns"]) for way in WAYS}
+    found = {way: np.array(result["returns"]) for way, result in parts.results_of(out, WAYS).items()}
     plain, rows = found["scratch"].mean(axis=1), []
     for way, scores in found.items():
         areas = scores.mean(axis=1)

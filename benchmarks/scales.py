@@ -113,8 +113,7 @@ def main() -> None:
         return measure(arguments, arguments.agents[0])
     todo = [part(arguments, agent, scaled) for agent in arguments.agents for scaled in (True, False)]
     left = parts.run_parts(__file__, todo, arguments.out, arguments)
-    print(table(arguments.out))
-    parts.require_all(left)
+    parts.end(table(arguments.out), arguments.out, left)
 
 
 def part(arguments: argparse.Namespace, agent: str, scaled: bool) -> parts.Part:
@@ -175,12 +174,10 @@ def varied(protocol: Protocol, scales: list[float]) -> dict[str, Any]:
 
 
 def table(out: Path) -> str:
-    """Return the returns of all agents that have finished, and write them as ``OUT/table.md``."""
+    """Return the returns of all agents that have finished."""
     found = {path.stem: json.loads(path.read_text()) for path in sorted(out.glob("*.json"))}
     titles = ["agent", "scale", "last return", "less the control's", "mean return", "less the control's", "seconds"]
-    text = markdown(titles, [line for name in AGENTS if name in found for line in lines(found, name)])
-    (out / "table.md").write_text(text + "\n")
-    return text
+    return markdown(titles, [line for name in AGENTS if name in found for line in lines(found, name)])
 
 
 def lines(found: dict[str, Any], agent: str) -> Iterator[list[str]]:

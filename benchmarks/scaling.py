@@ -68,8 +68,7 @@ def main() -> None:
         return
     of_all = [part(*each, arguments) for each in settings(arguments, count)]
     left = parts.run_parts(__file__, of_all, arguments.out, arguments)
-    tabulate(arguments)
-    parts.require_all(left)
+    parts.end(tabulate(arguments), arguments.out, left)
 
 
 def settings(arguments: argparse.Namespace, count: int) -> list[tuple[str, int]]:
@@ -154,8 +153,8 @@ def row(axis: str, value: int, training: Any, base: Any) -> dict:
     }
 
 
-def tabulate(arguments: argparse.Namespace) -> None:
-    """Write, print and draw what all results in the folder have."""
+def tabulate(arguments: argparse.Namespace) -> str:
+    """Return the tables of all results in the folder, and write and draw what was asked for."""
     found = list(parts.read_results(arguments.out))
     rows = [line for result in found for line in result["rows"]]
     tables = []
@@ -164,14 +163,13 @@ def tabulate(arguments: argparse.Namespace) -> None:
         tables.append(table(of_axis))
         if arguments.plots:
             draw(arguments.plots / f"scaling-{axis}.png", axis, of_axis)
-    (arguments.out / "table.md").write_text("\n\n".join(tables) + "\n")
-    print("\n\n".join(tables))
     if arguments.json:
         machines = [json.loads(text) for text in sorted({json.dumps(result["machine"]) for result in found})]
         kept = {name: value for name, value in vars(arguments).items() if name not in ("json", "plots", "part")}
         report = {"benchmark": os.path.basename(__file__), "machines": machines, "settings": kept, "rows": rows}
         with open(arguments.json, "x") as file:
             json.dump(report, file, indent=2, default=str)
+    return "\n\n".join(tables)
 
 
 def table(rows: list[dict]) -> str:

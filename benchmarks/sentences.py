@@ -18,7 +18,6 @@ last evaluation; the share is that of what the told agent earns on the same task
 """
 
 import argparse
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -99,18 +98,15 @@ def shuffled(arguments: argparse.Namespace, result: Result) -> dict[str, np.ndar
 
 
 def table(out: Path) -> str:
-    """Return what all ways that have finished earn by split, and write it as ``OUT/table.md``."""
-    paths = {way: out / f"{way}.json" for way in WAYS}
-    found = {way: json.loads(path.read_text()) for way, path in paths.items() if path.exists()}
+    """Return what all ways that have finished earn by split."""
+    found = parts.results_of(out, WAYS)
     last = {way: {split: np.array(x)[:, -1] for split, x in each["returns"].items()} for way, each in found.items()}
     if "reads" in found:
         last[f"reads, {_SHUFFLED}"] = {split: np.array(x)[:, -1] for split, x in found["reads"][_SHUFFLED].items()}
     told = {split: x.mean() for split, x in last.get("told", {}).items()}
     cell = lambda split, x: f"{stats.seed_interval(x):.2f}" + (f", {x.mean() / told[split]:.2f}" if told else "")
     lines = [[f"`{way}`", *(cell(split, x) for split, x in scores.items())] for way, scores in last.items()]
-    text = markdown(["way", *(f"{split}, share" for split in SPLITS)], lines)
-    (out / "table.md").write_text(text + "\n")
-    return text
+    return markdown(["way", *(f"{split}, share" for split in SPLITS)], lines)
 
 
 if __name__ == "__main__":

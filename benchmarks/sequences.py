@@ -106,8 +106,7 @@ def main() -> None:
         return measure(arguments, protocol, out, arguments.methods[0])
     todo = [part(arguments, protocol, out, method) for method in protocol.methods]
     left = parts.run_parts(__file__, todo, out, arguments)
-    print(table(out))
-    parts.require_all(left)
+    parts.end(table(out), out, left)
 
 
 def part(arguments: argparse.Namespace, protocol: Protocol, out: Path, method: str) -> parts.Part:

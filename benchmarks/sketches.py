@@ -27,7 +27,6 @@ held-out tasks, which are all that the last two ways learn.
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -108,13 +107,10 @@ def new_tasks(arguments: argparse.Namespace, way: str) -> dict[str, Any]:
 
 
 def table(out: Path) -> str:
-    """Return the last returns of all ways that have finished, and write them as ``OUT/table.md``."""
-    paths = {way: out / f"{way}.json" for way in WAYS}
-    found = {way: json.loads(path.read_text()) for way, path in paths.items() if path.exists()}
+    """Return the last returns of all ways that have finished."""
+    found = parts.results_of(out, WAYS)
     titles = ["way", "mean", "worst task", "held-out tasks", "million steps", "training s"]
-    text = markdown(titles, [line(way, result) for way, result in found.items()])
-    (out / "table.md").write_text(text + "\n")
-    return text
+    return markdown(titles, [line(way, result) for way, result in found.items()])
 
 
 def line(way: str, result: dict[str, Any]) -> list[str]:

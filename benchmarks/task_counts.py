@@ -68,8 +68,7 @@ def main() -> None:
     if parts.is_part():
         return measure(arguments, *every[0])
     left = parts.run_parts(__file__, [part(arguments, *each) for each in every], arguments.out, arguments)
-    print(table(arguments.out))
-    parts.require_all(left)
+    parts.end(table(arguments.out), arguments.out, left)
 
 
 def part(arguments: argparse.Namespace, family: str, tasks: int) -> parts.Part:

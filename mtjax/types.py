@@ -32,11 +32,11 @@ class Kind:
         return jnp.zeros(self.shape, self.dtype)
 
     def masked(self, action: Array, mask: Array | None) -> Array:
-        """Return actions without what a task does not have; of choices policies draw nothing else."""
+        """Return actions with 0 for what a task does not have. Choices stay: policies draw only those that it has."""
         return action
 
     def narrow(self, action: Array) -> Array:
-        """Return such actions from those of a mixture, whose widest family has as many entries or more."""
+        """Return this family's part of the actions of a mixture, which are as wide as its widest family's."""
         return action
 
 
@@ -69,7 +69,7 @@ class Continuous(Kind):
         return action if mask is None else action * mask
 
     def narrow(self, action: Array) -> Array:
-        """Return such actions from those of a mixture, whose widest family has as many entries or more."""
+        """Return this family's part of the actions of a mixture, which are as wide as its widest family's."""
         return action[..., : self.size]
 
 

@@ -559,8 +559,8 @@ def test_other_agents_stand_on_it(name, representation):
     place = "own" if name == "disjoint" else "shared"
     for nets, there in ((state.nets, {"latent", "transition", "reward"}), (state.slow, {"latent"})):
         assert {"latent", "transition", "reward"} & set(getattr(nets["representation"], place)) == there
-        assert not set(agent.representation.names) & set(nets["critic"].parts)
-    assert not set(agent.representation.names) & set(state.nets["actor"].parts)
+        assert not {*agent.representation.slow, *agent.representation.models} & {*nets["critic"].parts}
+    assert not {*agent.representation.slow, *agent.representation.models} & {*state.nets["actor"].parts}
     assert jax.eval_shape(lambda s: act_once(agent, s, jnp.ones(3), STRANGER, None), state).shape == (2,)
 
 

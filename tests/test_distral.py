@@ -15,7 +15,7 @@ from probes import act as act_once
 from mtjax.agents import agent
 from mtjax.agents.distral import Distral
 from mtjax.agents.networks import Params
-from mtjax.agents.parts.gradients.descent import descend
+from mtjax.agents.parts.gradients import descent
 from mtjax.agents.parts.policies import Gaussian
 from mtjax.agents.replay_batches import Batch
 from mtjax.agents.sac import SAC
@@ -322,7 +322,7 @@ def test_a_bandits_optimum(alpha):
         actor, memory = carry
         loss = lambda actor, keys: jax.vmap(made.actor_loss, (axes, 0, 0))(nets | {"actor": actor}, own, keys)[0]
         slope = jax.grad(lambda actor: jnp.mean(loss(actor, jax.random.split(key, 2))))(actor)
-        actor, memory = descend(optimizer, slope, memory, actor)
+        actor, memory = descent.step(optimizer, slope, memory, actor)
         policy = lambda nets: made.policy_outputs(nets, FEATURES, jnp.zeros(1))
         return (actor, memory), jax.vmap(policy, (axes,))(nets | {"actor": actor})
 

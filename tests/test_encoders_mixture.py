@@ -12,6 +12,9 @@ from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.encoders.mixture import Experts, top_k_softmax
 from mtjax.agents.parts.encoders.moore import orthonormal
+from mtjax.command.keywords import configured
+from mtjax.envs.probes import Probe
+from mtjax.training.launch import check
 from mtjax.types import InputError, Spec
 
 TASKS, BATCH, OBS, ACTION, OUT, HIDDEN = 3, 4, 2, 1, 5, (7, 6)
@@ -253,12 +256,15 @@ MISFITS = [
 
 
 @pytest.mark.parametrize(("settings", "message"), MISFITS)
-def test_tables_of_tasks_must_fit_the_tasks(settings, message):
-    """Found while tracing, before anything compiles."""
+def test_tables_of_tasks_must_fit_the_tasks(settings, message, monkeypatch):
+    """By the agent, and before a run compiles anything or makes a folder."""
     made = agent("sac", encoder="moe", conditioning="one-hot", hidden=(4,), **settings)
-    tasks = tasks_of("one-step", (1.0, -0.5, 0.3))
+    monkeypatch.setattr(Probe, "tasks", lambda *_: tasks_of("one-step", (1.0, -0.5, 0.3)))
+    env = Probe()
     with pytest.raises(InputError, match=message):
-        jax.eval_shape(lambda: made.init(Spec.vector(3, 2, 1), tasks, jax.random.key(0)))
+        jax.eval_shape(lambda: made.init(env.spec, env.tasks(), jax.random.key(0)))
+    with pytest.raises(InputError, match=message):
+        check(configured(env, made, {}, plan={}))
 
 
 REFUSED = [

@@ -203,7 +203,17 @@ _RUN = ("training.run", "training.journal", "training.memory", "training.host_re
 READERS = ("learning", "compiling", "parallel.axes", "saved.folder", *_RUN)
 KNOWN = {  # where it is known which class it is
     types.Env: {"calls", "parts", "relabels", "varied", "fresh_goals", "observe_worlds", "returning", "distance"},
-    types.Agent: {"adapt", "conditioning", "gradients", "heads", "policies", "policy", "representation", "view"},
+    types.Agent: {
+        "adapt",
+        "conditioning",
+        "encoder",
+        "gradients",
+        "heads",
+        "policies",
+        "policy",
+        "representation",
+        "view",
+    },
     types.Experience: {"capacity", "hindsight", "n_step"},
 }
 

@@ -1,6 +1,7 @@
 """MAML: its steps by the closed form of two arms, what plays when, and navigation that a step makes better."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,12 @@ import mtjax
 from mtjax.agents import agent, clipped_ratio, for_action
 from mtjax.agents.maml import MAML
 from mtjax.agents.parts.policies import Taken
+from mtjax.command.keywords import configured
 from mtjax.envs.probes import Probe, World, tasks_of
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Episodes, adapted, evaluate
+from mtjax.parallel import mesh as meshes
+from mtjax.training.launch import check
 from mtjax.types import Discrete, InputError, Spec, Step, Transition
 
 KEY = jax.random.key(0)
@@ -164,6 +168,16 @@ def test_steps_go_on_over_rollouts():
 def test_what_does_not_adapt_is_refused(settings, message):
     with pytest.raises(InputError, match=message):
         agent("maml", **settings)
+
+
+def test_devices_that_would_share_a_seeds_worlds_are_refused_before_a_run(monkeypatch):
+    mesh = SimpleNamespace(shape={"seeds": 2, "envs": 1}, size=2)
+    config = configured(Walk(), tiny("maml"), {}, plan={})
+    monkeypatch.setattr(meshes, "mesh_for", lambda *_: mesh)
+    check(config.checked())
+    mesh.shape = {"seeds": 1, "envs": 2}
+    with pytest.raises(InputError, match="2 devices would share them; use no more devices than seeds"):
+        check(config.checked())
 
 
 def test_drawn_tasks_are_refused_before_a_folder_is_made(tmp_path):

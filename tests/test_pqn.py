@@ -92,7 +92,7 @@ def test_exploration_falls_along_a_line_and_evaluation_has_none():
     agent = small(epsilon=0.2, epsilon_rollouts=4)
     state, shares = agent.init(SPEC, TASKS, KEY), []
     for _ in range(6):
-        shares.append(float(agent.share(state)))
+        shares.append(float(agent.exploration(state)))
         state = agent.observe(state, steps_of(agent), TASKS)
     np.testing.assert_allclose(shares, [1.0, 0.8, 0.6, 0.4, 0.2, 0.2], rtol=1e-5)
     task, obs = pick(TASKS, 0), jnp.float32([0.3, -1.0, 2.0])

@@ -188,7 +188,7 @@ def test_nothing_observed_scales_nothing():
     """Factor 1 and offset 0, for every scaling."""
     batch = random_batch(0, 2, BATCH, SPEC)
     for scaling in (cls() for cls in SCALINGS.values()):
-        rewards = scaling.rewards(scaling.init(2), batch, 0.9, jnp.full(1, 0.5))
+        rewards = scaling.rewards(scaling.init(2), batch, jnp.full(2, 0.9), jnp.full(1, 0.5))
         np.testing.assert_allclose(rewards, batch.reward, rtol=1e-6)
 
 
@@ -269,7 +269,7 @@ def test_targets_in_a_tasks_units_are_its_targets_in_reward():
     memory = scaling.init(2)._replace(mean=jnp.float32([3.0, -100.0]), variance=jnp.float32([4.0, 900.0]))
     mean, std = np.array([[3.0], [-100.0]]), np.array([[2.0], [30.0]])
     next_value, discount = np.float32(np.random.default_rng(1).normal(size=(2, 6))), 0.9 * np.asarray(batch.discount)
-    found = scaling.rewards(memory, batch, 0.9, NO_BONUS) + discount * next_value
+    found = scaling.rewards(memory, batch, jnp.full(2, 0.9), NO_BONUS) + discount * next_value
     expected = (batch.reward + discount * (mean + std * next_value) - mean) / std
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
     assert 0 in discount
@@ -482,4 +482,4 @@ def test_a_batch_is_scaled_and_nothing_else_of_it():
     memory = scaling.init(2)._replace(variance=jnp.float32([4.0, 25.0]))
     assert isinstance(batch, Transition)
     expected = batch.reward / np.array([[2.0], [5.0]])
-    np.testing.assert_allclose(scaling.rewards(memory, batch, 0.9, NO_BONUS), expected, rtol=1e-5)
+    np.testing.assert_allclose(scaling.rewards(memory, batch, jnp.full(2, 0.9), NO_BONUS), expected, rtol=1e-5)

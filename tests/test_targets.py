@@ -89,17 +89,22 @@ def test_vtrace_on_policy_is_generalised_advantages():
     np.testing.assert_allclose(found.target, VALUE + advantage, atol=1e-6)
 
 
+def retrace(steps, q, next_value, log_ratio, gamma, lambda_):
+    """The targets of values of actions."""
+    return targets.td(steps, next_value + targets.corrections(steps, q, next_value, log_ratio, gamma, lambda_), gamma)
+
+
 def test_retrace_cuts_by_the_ratio_of_the_next_action():
     c = LAMBDA * np.minimum(1.0, np.exp(LOG_RATIO))
     after = lambda t, world: GAMMA * float(c[t + 1, world]) if t + 1 < LENGTH else 0.0
     expected = VALUE + loop(error, after)
-    found = targets.retrace(STEPS, VALUE, NEXT_VALUE, LOG_RATIO, GAMMA, LAMBDA)
+    found = retrace(STEPS, VALUE, NEXT_VALUE, LOG_RATIO, GAMMA, LAMBDA)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_retrace_with_lambda_0_is_td():
     """To the bit."""
-    found = targets.retrace(STEPS, VALUE, NEXT_VALUE, LOG_RATIO, GAMMA, 0.0)
+    found = retrace(STEPS, VALUE, NEXT_VALUE, LOG_RATIO, GAMMA, 0.0)
     np.testing.assert_array_equal(found, targets.td(STEPS, NEXT_VALUE, GAMMA))
 
 
@@ -111,10 +116,10 @@ def test_retrace_on_policy_is_the_lambda_return():
     one = lambda *x: jnp.float32(x)[:, None]
     goes_on = jnp.zeros((3, 1), bool)
     steps = Transition(None, None, one(8, 4, 2), one(1, 1, 1), None, goes_on, goes_on, goes_on)
-    found = targets.retrace(steps, one(99, 20, 10), one(20, 10, 6), one(0, 0, 0), 0.5, 0.5)
+    found = retrace(steps, one(99, 20, 10), one(20, 10, 6), one(0, 0, 0), 0.5, 0.5)
     np.testing.assert_allclose(found[:, 0], [14.9375, 7.75, 5], rtol=1e-6)
     value = np.concatenate([VALUE[:1], NEXT_VALUE[:-1]])
-    found = targets.retrace(STEPS, value, NEXT_VALUE, 0 * LOG_RATIO, GAMMA, LAMBDA)
+    found = retrace(STEPS, value, NEXT_VALUE, 0 * LOG_RATIO, GAMMA, LAMBDA)
     expected = targets.lambda_returns(STEPS, NEXT_VALUE, GAMMA, LAMBDA)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
@@ -187,8 +192,8 @@ def test_retrace_converges_to_the_values_of_the_policy(chain):
     times = np.bincount(place.ravel(), minlength=exact.size)
 
     @jax.jit
-    def retrace(q, then):
-        return targets.retrace(chain.steps, q, then, chain.log_ratio, gamma, 1.0)
+    def corrected(q, then):
+        return retrace(chain.steps, q, then, chain.log_ratio, gamma, 1.0)
 
     @jax.jit
     def returns(q, then):
@@ -203,4 +208,4 @@ def test_retrace_converges_to_the_values_of_the_policy(chain):
             q += (np.bincount(place.ravel(), error.ravel(), exact.size) / np.maximum(times, 1)).reshape(exact.shape)
         return np.average(np.abs(q - exact).ravel(), weights=times) / np.mean(exact)
 
-    assert error_of(retrace) < 0.02 < 0.05 < error_of(returns)
+    assert error_of(corrected) < 0.02 < 0.05 < error_of(returns)

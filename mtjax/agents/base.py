@@ -116,8 +116,6 @@ class BaseAgent(abc.ABC):
     """Whether it goes on with what it chose in earlier steps of the episode, which its memory holds."""
     one_knowledge: ClassVar[bool] = False
     """Whether tasks share what knows them even where each has networks of its own."""
-    least_loss: ClassVar[float] = 0.0
-    """Lower bound of the critics' loss of a task, without what the representation adds."""
     target: ClassVar[Target] = Target()
     """What the critics are fitted to, in agents with a replay."""
     continual: ClassVar[Continual] = Continual()
@@ -255,6 +253,7 @@ class BaseAgent(abc.ABC):
         combinations.require_sight(self, spec)
         combinations.require_policy(self, spec)
         view, num_tasks, own = self.view, len(tasks.id), combinations.disjoint(self)
+        self.encoder.require(num_tasks)
         inputs, action = init_inputs(spec, num_tasks), spec.action.encode(spec.action.blank())
         vectors, seen = self.conditioning.table(spec, num_tasks), view.example(spec, inputs)
         first = jax.tree.map(lambda x: x[0], tasks._replace(blocks=None))
@@ -323,7 +322,7 @@ class BaseAgent(abc.ABC):
         """Take one gradient step on windows (T, B, L, ...) of the training tasks; metrics are (T,).
 
         Args:
-            number: () how many updates came before.
+            number: () of the update, from the end of the first warm-up on; those that a later one leaves out count too.
         """
 
     def observe(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:

@@ -74,7 +74,7 @@ def gae(agent: Any, tasks: Task, steps: Transition, value: Array, next_value: Ar
 
 
 def normalized(how: Normalization, advantage: Array) -> Array:
-    """Scale advantages (T, H, E) to mean 0 and standard deviation 1: never, over all tasks together, or in each."""
+    """Scale advantages (T, H, E) to mean 0 and standard deviation 1: over all tasks, in each task, or not at all."""
     mean, spread = moments(how, advantage)
     return (advantage - mean) / spread
 

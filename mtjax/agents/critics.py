@@ -84,7 +84,7 @@ class Units(NamedTuple):
 
 
 def models(agent: Any, state: AgentState, flat: Transition, tasks: Task, next_obs: Any) -> dict[str, Any]:
-    """Return what a batch holds for a representation that learns."""
+    """Return what a representation that learns needs in a batch: actions, rewards and next observations, by name."""
     if not agent.representation.learns:
         return {}
     return {
@@ -123,8 +123,6 @@ def over_rollout(function: Any, agent: Any, state: AgentState, features: Array, 
 def renew(agent: Any, state: AgentState, target: Array) -> tuple[AgentState, Units]:
     """Move the critic's units by targets (T, ...), and with PopArt rescale its heads to them."""
     target, old = target.reshape(len(target), -1), Units.of(state)
-    scaling, _ = agent.scaling.renew(state.nets["scaling"].own, target, ())
-    state = state.with_nets(scaling=Params({}, scaling))
     if agent.value_normalization == "none":
         return state, old
     new = old.moved(target, agent.value_rate)

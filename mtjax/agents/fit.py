@@ -74,7 +74,8 @@ class Fit:
         """
         loss, params, data = self.problem(loss, nets, data)
         combined = surgery.gradient(self.rule, loss, params, data, state.rule, key, importance, self.per_layer)
-        nets, optimizer = self.descend(state, _apart(combined.gradients), nets)
+        gradients = _apart(combined.gradients)
+        nets, optimizer = descent.step(self.optimizer, gradients, state.optimizer, self._learned(nets))
         rule = surgery.adapt_rule(self.rule, loss, _stacked(nets), data, combined)
         return Fitted(nets, FitState(optimizer, rule), combined.aux, combined.metrics)
 
@@ -88,10 +89,6 @@ class Fit:
 
         averaged = surgery.over_devices(of_learned) if self.over_devices else of_learned
         return Problem(averaged, _stacked(self._learned(nets)), (fixed.own, data))
-
-    def descend(self, state: FitState, gradients: Nets, nets: Nets) -> tuple[Nets, Any]:
-        """Return the networks that learn after an optimiser's step along their gradients, and its new state."""
-        return descent.descend(self.optimizer, gradients, state.optimizer, self._learned(nets))
 
     def _learned(self, nets: Nets) -> Nets:
         return {name: nets[name] for name in self.names}
@@ -119,8 +116,11 @@ def descend(
 
 
 def above_least(agent: Any, loss: Callable) -> Callable:
-    """Subtract its lower bound from the critics' loss of one task, for rules of surgery that compare losses."""
-    least = agent.least_loss + agent.representation.least_loss
+    """Subtract its lower bound from the critics' loss of one task, for rules of surgery that compare losses.
+
+    Only a representation has one other than 0.
+    """
+    least = agent.representation.least_loss
 
     def excess(nets: Nets, *data: Any) -> tuple[Array, Any]:
         value, aux = loss(nets, *data)

@@ -16,7 +16,6 @@ from mtjax.agents.parts.knowing import Knowing
 from mtjax.agents.state import AgentState, Nets, over_tasks
 from mtjax.experience import AdaptingRollouts
 from mtjax.experience.rollouts import windows
-from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, InputError, Key, Metrics, Task, Transition
 
 
@@ -71,7 +70,7 @@ class MAML(OnPolicy):
     gae_lambda: float = 1.0
     """Lambda of advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
     entropy_cost: float = 0.0
-    """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
+    """Weight of the entropy in the actor loss (c), in standard deviations of advantages, or of reward without these."""
     clip_range: float = 0.2
     """Clip the ratio of policies to this distance from 1 (epsilon)."""
     advantage_normalization: clipped_ratio.Normalization = "task"
@@ -107,8 +106,6 @@ class MAML(OnPolicy):
 
     def adapt(self, state: AgentState, steps: Transition, tasks: Task) -> AgentState:
         """Take an inner step for each task, given a rollout (T, H, E, ...) of its policy."""
-        if collectives.count() > 1:
-            raise InputError("maml needs all environments of a seed on one device; use no more devices than seeds")
         _, steps = self.assess(state, steps, tasks)
         _, batch = self.prepare(state, windows(steps, 0), tasks)
         of_task = lambda nets, batch: self.step_inside(nets, nets["adapted"], batch, Played.of(batch, 1))

@@ -112,7 +112,8 @@ class OnPolicy(BaseAgent):
     gae_lambda: float = 0.95
     """Lambda of advantages: 0 relies on the critic alone, 1 on the rewards of the rollout."""
     entropy_cost: float = 1e-2
-    """Weight of the entropy in the actor loss (c), in standard deviations of the advantage."""
+    """Weight of the entropy in the actor loss (c), in the unit of advantages there: their standard deviation, in impala
+    that of targets, and reward where nothing normalises them."""
     initial_std: float = 0.7
     """Standard deviation of the initial policy's actions, before the tanh. A policy of discrete ones begins with all as
     likely."""

@@ -65,7 +65,7 @@ class PPO(OnPolicy):
     clip_range: float = 0.2
     """Clip the ratio of policies to this distance from 1 (epsilon)."""
     value_clip: float = 0.0
-    """Clip the change of values in an update to this, in standard deviations of the targets; 0 does not clip."""
+    """Clip the change of values in an update to this, in the critic's units (value-normalization); 0 does not clip."""
     kl_limit: float = 0.0
     """Stop updating the actor until the next rollout once KL(pi_old | pi) exceeds this; 0 never stops."""
     advantage_normalization: clipped_ratio.Normalization = "task"

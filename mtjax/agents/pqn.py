@@ -123,9 +123,9 @@ class PQN(BaseAgent):
             return Acted(best, outputs=values)
         any_key, turn_key = jax.random.split(key)
         one = self.policy.draw(jnp.zeros_like(values), task.action_mask, any_key).action
-        return Acted(jnp.where(jax.random.uniform(turn_key) < self.share(state), one, best), outputs=values)
+        return Acted(jnp.where(jax.random.uniform(turn_key) < self.exploration(state), one, best), outputs=values)
 
-    def share(self, state: AgentState) -> Array:
+    def exploration(self, state: AgentState) -> Array:
         """Return the probability () of a uniform action."""
         passed = state.nets["exploration"].shared["rollouts"] / self.epsilon_rollouts
         return jnp.maximum(self.epsilon, 1 - (1 - self.epsilon) * passed)
@@ -157,7 +157,8 @@ class PQN(BaseAgent):
         """Take a gradient step on windows (T, B, L, ...) of a rollout; metrics are (T,)."""
         batch = self.view.keyed(self.batch(state, window, tasks), jax.random.fold_in(key, 1))
         state, fitted = descend(self.fits, "critic", state, self.loss, (batch,), key)
-        return state, fitted.aux | fitted.metrics | {"epsilon": jnp.broadcast_to(self.share(state), len(tasks.id))}
+        epsilon = {"epsilon": jnp.broadcast_to(self.exploration(state), len(tasks.id))}
+        return state, fitted.aux | fitted.metrics | epsilon
 
     def batch(self, state: AgentState, window: Transition, tasks: Task) -> Batch:
         """Return the batch (T, ...) for the loss, of windows (T, B, L, ...) with their targets."""

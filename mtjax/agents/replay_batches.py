@@ -11,7 +11,7 @@ from mtjax.agents.fit import Losses, above_least
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.policies import Taken
 from mtjax.agents.parts.values import reduce
-from mtjax.agents.rates import discounts, discounts_of_all
+from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState, Nets, axes_of
 from mtjax.experience import pictures
 from mtjax.experience.replay import joined
@@ -75,12 +75,12 @@ def prepare(agent: Any, state: AgentState, window: Transition, tasks: Task, key:
     past, next_past = view.around(inputs, window, batch, last)
     temperature = jnp.exp(state.nets["temperature"].parts["log"])
     bonus = temperature * abs(agent.target_entropy) * action_sizes(batch.action, tasks.action_mask) / 2
-    gamma = discounts(agent, tasks)
+    gamma = discounts_of_all(agent, tasks)
     return Batch(
         obs=view.see_all(inputs, batch.obs, past),
         action=batch.action,
         reward=agent.scaling.rewards(state.nets["scaling"].own, batch, gamma, bonus),
-        discount=(gamma[:, None] if jnp.ndim(gamma) else gamma) * batch.discount,
+        discount=gamma[:, None] * batch.discount,
         next_obs=view.see_all(inputs, batch.next_obs, next_past),
         features=view.features_of_all(state, batch, tasks),
         temperature=jnp.broadcast_to(temperature, len(tasks.id)),

@@ -165,7 +165,7 @@ class SAC(BaseAgent):
         """Take one gradient step on windows (T, B, L, ...) of the training tasks; metrics are (T,).
 
         Args:
-            number: () how many updates came before; actor and temperatures learn at every ``policy_delay``-th.
+            number: () as in ``BaseAgent.update``; actor and temperatures learn at every ``policy_delay``-th.
         """
         target_key, actor_key, critic_order, actor_order = jax.random.split(key, 4)
         batch = replay_batches.prepare(self, state, window, tasks, jax.random.fold_in(key, 1))

@@ -59,7 +59,7 @@ def allows(agent: BaseAgent, point: Point) -> bool:
 
 
 def shares(agent: BaseAgent, names: Iterable[str]) -> frozenset[str]:
-    """Return those names of numbers that end at 1, such as discounts."""
+    """Return the names of those numbers that may not exceed 1, such as discounts."""
     return frozenset(name for name in names if allows(agent, {name: 1 - 1e-6}) and not allows(agent, {name: 1.5}))
 
 

@@ -20,20 +20,20 @@ class Teacher(NamedTuple):
     """
 
     agent: Any
-    tasks: int  # that each run was trained on
-    context: int  # size of their contexts
-    runs: int
+    num_tasks: int  # that each run was trained on
+    context_size: int  # size of their contexts
+    num_runs: int
 
     def init(self, spec: Spec, tasks: Task, key: Key) -> Params:
         """Return a net for training ``tasks`` (T, ...) whose states are fresh, until those of runs take their place."""
         count = len(tasks.id)
         known = tasks
-        if self.tasks != count:
-            known = jax.tree.map(lambda x: x[jnp.arange(self.tasks) % count], tasks._replace(blocks=None))
-        known = known._replace(context=jnp.zeros((self.tasks, self.context)))
-        state = self.agent.init(spec._replace(context_size=self.context), known, key)._replace(fits={})
+        if self.num_tasks != count:
+            known = jax.tree.map(lambda x: x[jnp.arange(self.num_tasks) % count], tasks._replace(blocks=None))
+        known = known._replace(context=jnp.zeros((self.num_tasks, self.context_size)))
+        state = self.agent.init(spec._replace(context_size=self.context_size), known, key)._replace(fits={})
         none = jnp.zeros(count, jnp.int32)
-        return join([state] * self.runs, none, none, known.context[none])
+        return join([state] * self.num_runs, none, none, known.context[none])
 
     def act(self, net: Params, memory: Any, obs: Any, task: Task) -> Acted:
         """Choose the likeliest action for one observation of one task, whose net this is."""

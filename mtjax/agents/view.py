@@ -141,7 +141,7 @@ class View:
         return self.representation.perceive(nets["representation"], *self.know(nets, features, seen))
 
     def keyed(self, batch: Any, key: Key) -> Any:
-        """Return a batch (T, ...) with a key for each task, if the loss of what is known of it needs one."""
+        """Give each task of a batch (T, ...) a key if the conditioning's own loss draws. Else return the batch."""
         if not self.conditioning.draws:
             return batch
         keys = jax.random.split(key, len(batch.features))

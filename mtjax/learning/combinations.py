@@ -43,7 +43,8 @@ def require_env(settings: Settings, env: Env, agent: Agent) -> None:
 
     Raises:
         InputError: its trials draw tasks to which the agent would adapt, its worlds cannot go on, some tasks of a
-            mixture cannot be played alone, the replay does not fit it, or the agent cannot draw its actions.
+            mixture cannot be played alone, the replay does not fit it, the agent cannot draw its actions, or its
+            parts do not fit the tasks.
     """
     tasks = env.tasks("train")
     if agent.experience.adaptations and tasks.draws is not None:
@@ -55,8 +56,12 @@ def require_env(settings: Settings, env: Env, agent: Agent) -> None:
     if settings.plays.steps and tasks.blocks is not None:
         tasks.blocks.some(settings.plays.count(len(tasks.id)))
     agent.experience.check(env, settings.num_envs, settings.chunk_steps, agent.unroll)
-    if isinstance(agent, BaseAgent) and not isinstance(agent.policy, agent.policies):
+    if not isinstance(agent, BaseAgent):
+        return
+    if not isinstance(agent.policy, agent.policies):
         raise _draws_none(env, agent)
+    agent.conditioning.table(env.spec, len(tasks.id))
+    agent.encoder.require(len(tasks.id))
 
 
 def _draws_none(env: Env, agent: BaseAgent) -> InputError:
@@ -99,7 +104,7 @@ def _require_turns(settings: Settings, agent: Agent) -> None:
 
 def _require_way_back(settings: Settings, env: Any) -> None:
     """Refuse a curriculum that asks worlds to go back to their start, where they are reset or have no task for it."""
-    if not settings.plays.returns:
+    if not settings.plays.goes_back:
         return
     told = f"the curriculum {settings.curriculum}"
     if not settings.reset_free:

@@ -27,7 +27,7 @@ class Everything:
 
     steps: ClassVar[int] = 0  # of every environment, after which tasks change; 0 for never
     in_turn: ClassVar[bool] = False  # whether one task is played after another, for so many steps each
-    returns: ClassVar[bool] = False  # whether worlds go back to where they began, for which none may be reset
+    goes_back: ClassVar[bool] = False  # whether worlds go back to where they began, for which none may be reset
 
     def count(self, known: int) -> int:
         """Return the number T of tasks that are played at a time, of N that are known."""
@@ -60,7 +60,7 @@ class ForwardBackward(Everything):
     Han, Levine and Abbeel 2015, "Learning compound multi-step controllers under unknown dynamics"; EARL's FBRL.
     """
 
-    returns = True
+    goes_back = True
 
     def follow(self, env: Returning, listed: Task, task: Task, state: Any, key: Key) -> Task:
         back = env.returning(task)
@@ -78,7 +78,7 @@ class Graph(Everything):
     one, and a world that is at none towards the nearest. Gupta et al. give edges by hand.
     """
 
-    returns = True
+    goes_back = True
 
     def follow(self, env: Returning, listed: Task, task: Task, state: Any, key: Key) -> Task:
         draws = jax.vmap(draw_at, (None, 0))(listed, jnp.arange(len(listed.draws.id)))
@@ -99,7 +99,7 @@ class Random:
 
     played: int
     steps: int
-    in_turn, returns = False, False
+    in_turn, goes_back = False, False
     heard, next_rows, follow = Everything.heard, Everything.next_rows, Everything.follow
 
     def count(self, known: int) -> int:
@@ -122,7 +122,7 @@ class Sequence:
     """
 
     steps: int
-    in_turn, returns = True, False
+    in_turn, goes_back = True, False
     heard, next_rows, follow = Everything.heard, Everything.next_rows, Everything.follow
 
     def count(self, known: int) -> int:
@@ -158,7 +158,7 @@ class Heeding:
     played: int
     steps: int
 
-    in_turn, returns = False, False
+    in_turn, goes_back = False, False
     count, follow = Random.count, Everything.follow
 
     def rows(self, step: Array, known: int) -> Array:

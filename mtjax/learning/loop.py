@@ -189,13 +189,16 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
     """Advance all seeds by ``settings.chunk_steps`` steps of every environment.
 
     Returns:
-        the new state, and metrics: "return" and "episodes" (S, T), mean return and number of ended episodes; the
-        environment's (S, T), as means over these episodes' last steps; the agent's, as means (S, T) or (S,) over the
-        chunk; "lost" (S, T), how often a world was lost (``step_envs``), whose episode does not count; "bad_step"
-        (S, T), the first step whose numbers were not finite, or -1; "bad_reward" (S, T) that whose reward was not.
-        An episode's first observation counts to the step before it, or to the first of the chunk.
-        Worlds that are lost more than once, and at more than one in 10,000 steps of a task, count as numbers that are
-        not finite.
+        the new state, and metrics by name:
+            return: (S, T) the mean return of the episodes that ended.
+            episodes: (S, T) the number of these.
+            the environment's: (S, T) each, means over these episodes' last steps.
+            the agent's: (S, T) or (S,) each, means over the updates.
+            lost: (S, T) how often a world was lost (``step_envs``); its episode does not count.
+            bad_step: (S, T) the first step with numbers that were not finite, or -1. An episode's first observation
+                counts to the step before it, or to the first of the chunk. Lost worlds count as such numbers if they
+                are more than one, and more than one in 10,000 steps of the task.
+            bad_reward: (S, T) the first step with a reward that was not finite, or -1.
     """
     experience, known = agent.experience, tasks
     if settings.plays.steps:
@@ -424,7 +427,8 @@ def _learn(env, agent, tasks, learners: Any, state: TrainState, keys: Key) -> tu
 def _update(env, agent, tasks, learners: Any, data: Any, iteration: Array, keys: Key) -> tuple[Any, Metrics]:
     """Make the updates that follow ``iteration`` () steps of every environment, one after another."""
     experience = agent.experience
-    earlier = iteration // experience.steps - experience.warmup_steps // experience.steps - 1  # times of updates
+    # Times of updates since the first warm-up; those are counted too that a later one, of other tasks, leaves out.
+    earlier = iteration // experience.steps - experience.warmup_steps // experience.steps - 1
     numbers = earlier * experience.updates + jnp.arange(experience.updates)
 
     def learn_one(learner: Any, data: Any, key: Key) -> tuple[Any, Metrics]:

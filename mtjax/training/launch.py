@@ -6,6 +6,7 @@ from importlib import resources
 from typing import Any
 
 import jax
+from jax.sharding import Mesh
 
 from mtjax.agents import preset_of
 from mtjax.agents.combinations import require_sight
@@ -16,6 +17,7 @@ from mtjax.envs.task_table import forgetful
 from mtjax.frames import shown
 from mtjax.learning import combinations
 from mtjax.parallel import hosts
+from mtjax.parallel.collectives import AXIS
 from mtjax.saved.folder import remove_unused
 from mtjax.saved.policy import Policy, load
 from mtjax.saved.result import Result
@@ -45,12 +47,23 @@ def check(config: RunConfig, start: Policy | Sequence[Policy] | None = None) -> 
     if config.env:
         _require_named(config)
     combinations.require_env(config.played, family, learner)
-    if config.mesh is not None and (lost := forgetful(family)):
-        raise InputError(
-            f"{lost} steps on the host of one device, and this run is on {config.mesh.size}; show JAX one, such "
-            "as by CUDA_VISIBLE_DEVICES=0"
-        )
+    if config.mesh is not None:
+        _require_shared(config, config.mesh)
     require_sinks(config.tensorboard, config.wandb, config.trackio)
+
+
+def _require_shared(config: RunConfig, mesh: Mesh) -> None:
+    """Check that several devices can share a run's worlds."""
+    if lost := forgetful(config.family):
+        raise InputError(
+            f"{lost} steps on the host of one device, and this run is on {mesh.size}; show JAX one, such as by "
+            "CUDA_VISIBLE_DEVICES=0"
+        )
+    if config.learner.experience.adaptations and mesh.shape[AXIS] > 1:
+        raise InputError(
+            f"this agent adapts by all worlds of a seed together, and {mesh.shape[AXIS]} devices would share them; use "
+            "no more devices than seeds, such as by CUDA_VISIBLE_DEVICES=0"
+        )
 
 
 def _require_named(config: RunConfig) -> None:
@@ -63,7 +76,6 @@ def _require_named(config: RunConfig) -> None:
             f"{config.agent} learns from pictures, and {config.env} shows none: give --env.pixels=64, or for states "
             "use --agent=sac-conditioned, to which --agent.representation=encoded adds an encoder"
         )
-    learner.conditioning.table(family.spec, family.train_count)
 
 
 def load_start(config: RunConfig) -> Policy | tuple[Policy, ...] | None:

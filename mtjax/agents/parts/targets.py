@@ -63,7 +63,7 @@ def vtrace(
     Args:
         log_ratio: (L, ...) log pi(a|s) - log mu(a|s).
     """
-    ratio = jnp.exp(jnp.minimum(log_ratio, 20.0))
+    ratio = jnp.exp(log_ratio)
     rho, going = jnp.minimum(largest, ratio), lambda_ * ~(steps.cut | _last(steps))
     later = _summed(rho * (td(steps, next_value, gamma) - value), gamma * going * jnp.minimum(1.0, ratio))
     target = value + later
@@ -71,22 +71,15 @@ def vtrace(
     return VTrace(target, rho * (td(steps, ahead, gamma) - value))
 
 
-def retrace(
-    steps: Transition, q: Array, next_value: Array, log_ratio: Array, gamma: float | Array, lambda_: float | Array
-) -> Array:
-    """Return the targets of Q(s_t, a_t) for a policy pi, from steps of a policy mu (Munos et al. 2016, equation 4).
-
-    y_t = r_t + gamma d_t (V(s'_t) + x_t) with the ``corrections`` x.
-    """
-    return td(steps, next_value + corrections(steps, q, next_value, log_ratio, gamma, lambda_), gamma)
-
-
 def corrections(
     steps: Transition, q: Array, next_value: Array, log_ratio: Array, gamma: float | Array, lambda_: float | Array
 ) -> Array:
-    """Return what later steps add to the next values of Retrace; 0 where the sum is cut, and with lambda = 0.
+    """Return what later steps add to next values, for a policy pi from steps of a policy mu (Munos et al. 2016).
 
-    x_t = c_(t+1) (y_(t+1) - Q(s_(t+1), a_(t+1))),  c_t = lambda min(1, pi / mu)
+    With them the targets y of Q(s_t, a_t) are those of Retrace (equation 4). They are 0 where the sum is cut, and with
+    lambda = 0.
+        y_t = r_t + gamma d_t (V(s'_t) + x_t)
+        x_t = c_(t+1) (y_(t+1) - Q(s_(t+1), a_(t+1))),  c_t = lambda min(1, pi / mu)
 
     Args:
         q: (L, ...) of the actions that were taken.

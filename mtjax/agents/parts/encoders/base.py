@@ -34,6 +34,13 @@ class Identity:
         has_features = conditioning.tells or otherwise or not self.needs_features
         return "" if has_features else "works by the task's features, so conditioning cannot be none; use parameters"
 
+    def require(self, num_tasks: int) -> None:
+        """Check that the encoder can be had for so many training tasks.
+
+        Raises:
+            InputError: it cannot.
+        """
+
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         """Return a module (observations (..., O), features (..., Z) or (Z,), [actions (..., A)]) -> (..., width)."""
         return Trunk(hidden, layer_norm)

@@ -112,7 +112,7 @@ class MixtureTrunk(nn.Module):
             case "ensemble":
                 weights = jnp.full(spec.num_experts, 1 / spec.num_experts)
             case "identity" | "cluster":
-                weights = spec.weights_by_number(features)
+                weights = features @ jax.nn.one_hot(jnp.array(spec.expert_of_task), spec.num_experts)
             case _:
                 scores = Gate(spec.num_experts, spec.expert_widths, name="gate")(features)
                 weights = nn.softmax(scores) if spec.mode == "attention" else top_k_softmax(scores, spec.top_k)
@@ -169,14 +169,16 @@ class MoE(Identity):
             return f"picks experts by the task's number under mode={self.mode}; use conditioning=one-hot"
         return "" if self.mode == "ensemble" else super().refuses(conditioning, otherwise)
 
-    def weights_by_number(self, features: Array) -> Array:
-        """Return weights (..., K) for one-hot task numbers (..., T)."""
-        table = self.clusters or tuple(range(self.num_experts))
-        if len(table) != features.shape[-1]:
-            given = f"clusters={table}" if self.clusters else f"num-experts={self.num_experts}"
-            fits = f"fits {len(table)} training tasks, but there are {features.shape[-1]}"
+    @property
+    def expert_of_task(self) -> tuple[int, ...]:
+        """The expert of every training task, where its number picks one."""
+        return self.clusters or tuple(range(self.num_experts))
+
+    def require(self, num_tasks: int) -> None:
+        if self.mode in _BY_NUMBER and len(self.expert_of_task) != num_tasks:
+            given = f"clusters={self.clusters}" if self.clusters else f"num-experts={self.num_experts}"
+            fits = f"fits {len(self.expert_of_task)} training tasks, but there are {num_tasks}"
             raise InputError(f"mode={self.mode} with {given} {fits}")
-        return features @ jax.nn.one_hot(jnp.array(table), self.num_experts)
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:
         return MixtureTrunk(self, hidden, layer_norm)

@@ -1,8 +1,9 @@
 """Rules of gradient surgery that balance tasks over time, by weights that are learned.
 
 Both rules use ratios of losses, which make sense only if 0 is the lower bound of a loss. Agents therefore subtract the
-lower bound of their critics' losses (``least_loss``), as a log-likelihood, for one, may be negative. An actor's loss
-has no known bound, so ``for_actor`` returns rules that use no losses. A loss of 0 or less marks a task as absent.
+lower bound of what a representation adds to their critics' losses (``least_loss``), as a log-likelihood may be
+negative. An actor's loss has no known bound, so ``for_actor`` returns rules that use no losses. A loss of 0 or less
+marks a task as absent.
 """
 
 import dataclasses

@@ -80,7 +80,7 @@ def on_sphere(optimizer: optax.GradientTransformation) -> optax.GradientTransfor
     return optax.GradientTransformation(optimizer.init, step)
 
 
-def descend(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
+def step(optimizer: optax.GradientTransformation, gradients: Any, memory: Any, params: Any) -> tuple[Any, Any]:
     """Apply one optimiser step, and return the parameters and the optimiser's state."""
     # XLA would move the transpose of a batched product's gradient into Adam, and copy parameters and moments on a GPU.
     apart = lambda x: jax.lax.optimization_barrier(x) if x.ndim > 2 else x

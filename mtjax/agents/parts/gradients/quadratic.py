@@ -13,7 +13,7 @@ UNROLLED = 10
 """Most unknowns of a system that is solved by plain arithmetic."""
 
 
-def cosines(gram: Array) -> tuple[Array, Array, Array]:
+def conditioned(gram: Array) -> tuple[Array, Array, Array]:
     """Return cosines (T, T) with a ridge, lengths (T,) and a mask (T,) of the tasks that have a gradient.
 
     Tasks without a gradient count as orthogonal to the others, and of length 1.

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from mtjax.agents.parts.gradients.quadratic import RIDGE, cosines, minimise, solve
+from mtjax.agents.parts.gradients.quadratic import RIDGE, conditioned, minimise, solve
 from mtjax.types import Array, InputError, Key
 
 NEWTON_STEPS = 25
@@ -145,7 +145,7 @@ class CAGrad(Mean):
     @of_gram
     def weigh(self, gram: Array) -> Array:
         radius = self.cagrad_radius
-        matrix, norms, present = cosines(gram)
+        matrix, norms, present = conditioned(gram)
         along = jnp.mean(gram, axis=1)
         length = jnp.sqrt(jnp.maximum(jnp.mean(along), 0.0))  # |g_0|
         slope = jnp.clip(along / norms / jnp.where(length > 0, length, 1.0), -1.0, 1.0)
@@ -153,13 +153,13 @@ class CAGrad(Mean):
         shortest = jnp.min(lengths)
         budget = present * shortest / norms
 
-        def solve(multiplier: Array) -> tuple[Array, Array]:
+        def constrained(multiplier: Array) -> tuple[Array, Array]:
             x = minimise(matrix, slope, multiplier * budget)
             return x, jnp.sqrt(x @ matrix @ x)
 
         def narrow(bracket: Array, _) -> tuple[Array, tuple[Array, Array]]:
             multipliers = jnp.geomspace(bracket[0], bracket[1], CAGRAD_GRID)
-            x, reach = jax.vmap(solve)(multipliers)
+            x, reach = jax.vmap(constrained)(multipliers)
             high = jnp.clip(jnp.sum(reach > radius), 1, CAGRAD_GRID - 1)
             pair = jnp.stack([high - 1, high])
             return multipliers[pair], (x[pair], reach[pair])
@@ -183,7 +183,7 @@ class MGDA(Mean):
 
     @of_gram
     def weigh(self, gram: Array) -> Array:
-        matrix, norms, present = cosines(gram)
+        matrix, norms, present = conditioned(gram)
         inverse = present * jnp.min(jnp.where(present, norms, jnp.inf)) / norms
         weights = inverse * minimise(matrix, jnp.zeros(len(gram)), inverse)
         return weights / jnp.sum(weights)
@@ -204,8 +204,8 @@ class IMTLG(Mean):
 
     @of_gram
     def weigh(self, gram: Array) -> Array:
-        matrix, norms, present = cosines(gram)
-        weights = present * jnp.linalg.solve(matrix, 1.0 * present) / norms
+        matrix, norms, present = conditioned(gram)
+        weights = present * solve(matrix, 1.0 * present[:, None])[:, 0] / norms
         return weights / jnp.maximum(jnp.sum(weights), 0.1 * jnp.sum(jnp.abs(weights)))
 
 
@@ -222,7 +222,7 @@ class NashMTL(Mean):
 
     @of_gram
     def weigh(self, gram: Array) -> Array:
-        matrix, norms, present = cosines(gram)
+        matrix, norms, present = conditioned(gram)
 
         def newton(y: Array, _) -> tuple[Array, None]:
             scaled = y[:, None] * matrix * y
@@ -266,6 +266,6 @@ class UPGrad(Mean):
 
     @of_gram
     def weigh(self, gram: Array) -> Array:
-        matrix, norms, present = cosines(gram)
+        matrix, norms, present = conditioned(gram)
         unit = jax.vmap(lambda row: minimise(matrix, row, jnp.zeros(len(gram))))(matrix)
         return jnp.mean(jnp.eye(len(gram)) + norms[:, None] * unit * present / norms, axis=0)

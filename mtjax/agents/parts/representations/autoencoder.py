@@ -12,7 +12,7 @@ from mtjax.agents import parts
 from mtjax.agents.networks import MLP, Params
 from mtjax.agents.parts import vision
 from mtjax.agents.parts.knowing.last_steps import without_past
-from mtjax.agents.parts.representations.encoded import Encoded, init_part
+from mtjax.agents.parts.representations.encoded import PROJECTION, Encoded, init_part
 from mtjax.types import Array, Key, Metrics
 
 
@@ -46,8 +46,7 @@ class Autoencoder(Encoded):
     decoder_decay: float = 1e-7
     """Weight of the squared length of the decoder's parameters."""
 
-    names: ClassVar[tuple[str, ...]] = (*Encoded.names, "decoder")
-    slow: ClassVar[tuple[str, ...]] = Encoded.names
+    slow: ClassVar[tuple[str, ...]] = (*Encoded.slow, PROJECTION)
     models: ClassVar[tuple[str, ...]] = ("decoder",)
 
     def __post_init__(self):

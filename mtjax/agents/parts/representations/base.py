@@ -25,13 +25,13 @@ class Unseen(NamedTuple):
 class Plain:
     """Passes observations on to the networks as they are.
 
-    Every representation is a class with these methods. Its parameters are a network of the agent's, with parts of these
-    ``names``. The critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the
-    actor's loss does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Parameters are
-    those of one task unless stated otherwise.
+    Every representation is a class with these methods. If it ``learns``, its parameters are a network of the agent's.
+    The critics' loss trains them, together with losses of the representation's own, which ``join`` adds; the actor's
+    loss does not. What the actor's loss trains is the module ``sight``, which lies in the actor. Parameters are those
+    of one task unless stated otherwise.
     """
 
-    names: ClassVar[tuple[str, ...]] = ()  # of its parameters
+    learns: ClassVar[bool] = False  # whether it has parameters
     models: ClassVar[tuple[str, ...]] = ()  # names of parameters that no target is computed with
     own_target: ClassVar[tuple[str, ...]] = ()  # names of parameters that are their own targets
     rates: ClassVar[Mapping[str, float]] = {}  # steps of targets by name, where they are not the critics' ``tau``
@@ -45,11 +45,6 @@ class Plain:
 
     def __post_init__(self):
         parts.require_choices(self)
-
-    @property
-    def learns(self) -> bool:
-        """Whether it has parameters."""
-        return bool(self.names)
 
     def init(
         self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key

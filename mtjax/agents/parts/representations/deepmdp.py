@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from mtjax import frames
 from mtjax.agents import parts
 from mtjax.agents.networks import Params, Trunk
-from mtjax.agents.parts.representations.encoded import Encoded, apply_part, encode_tasks, require_visible
+from mtjax.agents.parts.representations.encoded import PROJECTION, Encoded, apply_part, encode_tasks, require_visible
 from mtjax.types import Array, InputError, Key, Metrics
 
 Transitions = Literal["deterministic", "probabilistic"]
@@ -127,8 +127,7 @@ class DeepMDP(Encoded):
     model_coefficient: float = 1.0
     """Weight of transition and reward loss relative to the critics' loss."""
 
-    names: ClassVar[tuple[str, ...]] = (*Encoded.names, "transition", "reward")
-    slow: ClassVar[tuple[str, ...]] = Encoded.names
+    slow: ClassVar[tuple[str, ...]] = (*Encoded.slow, PROJECTION)
     models: ClassVar[tuple[str, ...]] = ("transition", "reward")
     predicts: ClassVar[bool] = True
 

@@ -16,7 +16,6 @@ from mtjax.agents.parts.representations.base import Plain
 from mtjax.agents.parts.vision import NETWORKS, Projection, Vision, project, require_large, shift_pictures
 from mtjax.types import Array, Key, Transition
 
-ENCODERS = ("latent",)
 PROJECTION = "projection"
 
 
@@ -80,8 +79,8 @@ class Encoded(Plain):
     encodes s and s' once each, for critics, targets and actor."""
 
     sees_pictures: ClassVar[bool] = True
-    names: ClassVar[tuple[str, ...]] = (*ENCODERS, PROJECTION)
-    slow: ClassVar[tuple[str, ...]] = ENCODERS  # those whose target copies move by encoder_tau
+    learns: ClassVar[bool] = True
+    slow: ClassVar[tuple[str, ...]] = ("latent",)  # those whose target copies move by encoder_tau
 
     def __post_init__(self):
         super().__post_init__()

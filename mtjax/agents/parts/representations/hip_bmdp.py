@@ -68,7 +68,6 @@ class HiPBMDP(Encoded):
     """Theta of an unseen task: the mean of all training tasks', zero, that of the nearest training task (by its true
     parameters), or inferred from the last steps."""
 
-    names: ClassVar[tuple[str, ...]] = (*DeepMDP.names, "embedding", "guess")
     slow: ClassVar[tuple[str, ...]] = (*DeepMDP.slow, "embedding")
     predicts: ClassVar[bool] = True
     embeds: ClassVar[bool] = True

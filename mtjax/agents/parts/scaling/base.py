@@ -20,7 +20,7 @@ class NoScaling:
     rescales: ClassVar[bool] = False  # whether it rescales the heads of critics, each task's own, as values move
     init, begin, remember, observe = Watcher.init, Watcher.begin, Watcher.remember, Watcher.observe
 
-    def units(self, memory: Any, gamma: float | Array, bonus: Array) -> tuple[Array, Array] | None:
+    def units(self, memory: Any, gamma: Array, bonus: Array) -> tuple[Array, Array] | None:
         """Return each task's factor and offset (T,); None for 1 and 0.
 
         Args:
@@ -28,17 +28,16 @@ class NoScaling:
         """
         return None
 
-    def rewards(self, memory: Any, batch: Transition, gamma: float | Array, bonus: Array) -> Array:
-        """Return the rewards (T, B) of a batch in each task's units; ``gamma`` is () or (T,)."""
+    def rewards(self, memory: Any, batch: Transition, gamma: Array, bonus: Array) -> Array:
+        """Return the rewards (T, B) of a batch in each task's units, given each task's discount (T,)."""
         units = self.units(memory, gamma, bonus)
         if units is None:
             return batch.reward
         factor, offset = (x[:, None] for x in units)
-        gamma = gamma[:, None] if jnp.ndim(gamma) else gamma  # type: ignore
-        return factor * (batch.reward - (1 - gamma * batch.discount) * offset)
+        return factor * (batch.reward - (1 - gamma[:, None] * batch.discount) * offset)
 
     def renew(self, memory: Any, target: Array, critics: tuple[Params, ...]) -> tuple[Any, tuple[Params, ...]]:
-        """Update the memory by the targets (T, B) of an update, and rescale the critics to the new units."""
+        """Update the memory by the targets (T, B) of an update from a replay, and rescale critics to the new units."""
         return memory, critics
 
     def reset(self, memory: Any) -> Any:

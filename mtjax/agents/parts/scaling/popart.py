@@ -68,7 +68,7 @@ class PopArt(NoScaling):
         """Return the standard deviation (T,) that divides targets."""
         return jnp.clip(jnp.sqrt(memory.variance), 1e-4, 1e6)
 
-    def units(self, memory: Estimates, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Estimates, gamma: Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / self.std(memory), memory.mean
 
     def renew(self, memory: Estimates, target: Array, critics: tuple[Params, ...]):

@@ -64,7 +64,7 @@ class ReturnScaling(NoScaling):
         largest = lambda old, new: jnp.maximum(old, jnp.max(jnp.abs(new), axis=1))
         return LargestReturns(largest(memory.discounted, sums.discounted), largest(memory.reward, mean))
 
-    def units(self, memory: LargestReturns, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: LargestReturns, gamma: Array, bonus: Array) -> tuple[Array, Array]:
         horizon = 1 / (1 - gamma)
         largest = jnp.maximum(memory.discounted, horizon * memory.reward)
         known = largest > 0
@@ -115,7 +115,7 @@ class ReturnNormalization(NoScaling):
         largest = jnp.maximum(memory.largest, jnp.max(jnp.abs(returns), axis=1))
         return SpreadOfReturns(normalize.update(memory.moments, returns.T), largest)
 
-    def units(self, memory: SpreadOfReturns, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: SpreadOfReturns, gamma: Array, bonus: Array) -> tuple[Array, Array]:
         variance = memory.moments.deviation / jnp.maximum(memory.moments.count, 1)
         divisor = jnp.maximum(jnp.sqrt(variance), memory.largest / self.return_range)
         return 1 / jnp.where(divisor > 0, divisor, 1.0), jnp.zeros_like(divisor)

@@ -37,7 +37,7 @@ class RewardScaling(NoScaling):
         variance_now = jnp.mean(jnp.square(steps.reward - mean[:, None]), axis=1)
         return Moments(mean, memory.variance + rate * (variance_now - memory.variance))
 
-    def units(self, memory: Moments, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: Moments, gamma: Array, bonus: Array) -> tuple[Array, Array]:
         return 1 / (jnp.sqrt(memory.variance) + 1e-8), jnp.zeros_like(memory.mean)
 
 
@@ -82,7 +82,7 @@ class AdaptiveScaling(NoScaling):
         means = jnp.maximum(memory.mean, self.least_mean_reward)
         return jnp.where(memory.factor > 0, memory.factor, jnp.max(means) / means)
 
-    def units(self, memory: MeanRewards, gamma: float | Array, bonus: Array) -> tuple[Array, Array]:
+    def units(self, memory: MeanRewards, gamma: Array, bonus: Array) -> tuple[Array, Array]:
         return self.factors(memory), jnp.zeros_like(memory.mean)
 
     def renew(self, memory: MeanRewards, target: Array, critics: tuple[Params, ...]):
