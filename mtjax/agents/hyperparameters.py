@@ -100,15 +100,16 @@ def for_action(agent: A, action: Action) -> A:
 
 
 def require_value_range(agent: Any) -> None:
-    """Refuse categorical critics that have no chosen range and whose returns are not scaled to the default range.
+    """Refuse categorical critics whose range is smaller than that of scaled returns, or nobody's choice without one.
 
     Raises:
         InputError: the agent has such critics.
     """
-    if "value" in kinds_of(agent) and not agent.scaling.fits_returns:
-        reason = agent.value.refuses(parts.name_of(SCALINGS, agent.scaling))
-        if reason:
-            raise InputError(f"value={parts.name_of(VALUES, agent.value)} {reason}")
+    if "value" not in kinds_of(agent):
+        return
+    usual, scaling = type(agent).__dataclass_fields__["value"].default_factory(), agent.scaling
+    if reason := agent.value.refuses(parts.name_of(SCALINGS, scaling), scaling.return_range, usual):
+        raise InputError(f"value={parts.name_of(VALUES, agent.value)} {reason}")
 
 
 def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
