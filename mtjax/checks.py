@@ -241,13 +241,12 @@ def require_library(module: str, what: str = "") -> Any:
 
 def require_choices(holder: Any) -> None:
     """Require every setting of ``Literal`` type to be one of its choices."""
-    for field in dataclasses.fields(holder):
-        allowed = get_args(field.type) if get_origin(field.type) is Literal else ()
-        value = getattr(holder, field.name)
-        if allowed:
-            require_text(value, field.name)
-        if allowed and value not in allowed:
-            raise nearest_error(field.name.replace("_", "-"), value, allowed)
+    for name, kind in _types(type(holder)).items():
+        if get_origin(kind) is Literal:
+            value, allowed = getattr(holder, name), get_args(kind)
+            require_text(value, name)
+            if value not in allowed:
+                raise nearest_error(name.replace("_", "-"), value, allowed)
 
 
 def _require(rule: str, holds: Callable[[Any], Any]) -> Callable[..., None]:

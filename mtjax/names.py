@@ -207,6 +207,8 @@ def _as_argument(flag: str, name: str, value: str | None) -> str:
     name = _OTHER_NAMES.get(name, name.replace("-", "_"))
     if value is None:
         return name
+    if value in ("true", "false"):
+        return f"{name}={value.capitalize()}"
     as_is = value.isupper() or re.fullmatch(r"[\d.e-]+", value)  # a word to fill in, or a number
     return f"{name}={value}" if as_is else f"{name}={value!r}"
 

@@ -282,6 +282,7 @@ def test_pictures_of_games_choose_the_network_of_their_paper():
     for device in ("cpu", "gpu"):
         flags = ["--env=gymnax:Asterix-MinAtar", "--agent=pqn", f"--preset={device}"]
         seeing, plain = parse([*flags, "--env.pictures"]), parse(flags)
+        assert parse([*flags, "--env.pictures", "--env.no-pictures"]) == plain
         learner = mtjax.preset("gymnax:Asterix-MinAtar", "pqn", device, pictures=True).learner
         assert seeing.family.pictures and seeing.learner == learner and not plain.family.pictures
         assert learner.representation == Encoded(latent_widths=(), vision="grid") and learner.hidden == (128,)

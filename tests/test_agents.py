@@ -384,6 +384,7 @@ REFUSED = [
     ("sac", {"conditioning": "onehot"}, r"unknown conditioning 'onehot'; did you mean 'one-hot'\?"),
     ("sac", {"heads": "own"}, "unknown heads 'own'; .*shared, per-task"),
     ("sac", {"gradients": "pc-grad"}, "unknown gradients 'pc-grad'; did you mean 'pcgrad'"),
+    ("sac", {"tune": "head"}, "unknown tune 'head'; did you mean 'heads'"),
     ("sac", {"hiden": (8,)}, "unknown setting of sac 'hiden'; did you mean 'hidden'"),
     ("sac", {"actor_lr": 0.0}, "actor-lr must be greater than 0, not 0.0"),
     ("sac", {"critic_lr": -1.0}, "critic-lr must be greater than 0, not -1.0"),

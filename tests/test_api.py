@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shlex
 
 import jax
@@ -15,6 +16,7 @@ import mtjax.evaluate
 import mtjax.train
 from mtjax import agents, checks, envs
 from mtjax.command import keywords, run_config
+from mtjax.command.flags import switched_off
 from mtjax.config import Plan, with_preset
 from mtjax.envs.family import Family
 from mtjax.learning.loop import Settings
@@ -135,6 +137,7 @@ def test_a_refused_run_leaves_no_folder(short_family, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "given", "said"),
     [
+        (["--trials=3", "--eval-episodes=10"], {"trials": 3, "eval_episodes": 10}, "10$"),  # though it is the usual
         (["--trials=2", "--eval-episodes=3"], {"trials": 2, "eval_episodes": 3}, "eval-episodes must be a multiple"),
         (["--population=pbt:100"], {"population": "pbt:100"}, "perturbs numbers of the agent that are swept"),
         (["--agent.value=c51"], {"value": "c51"}, "value=c51 reaches returns from -10 to 10"),
@@ -162,6 +165,46 @@ def test_a_configuration_is_checked_where_it_is_made(words, given, said, monkeyp
     with pytest.raises(InputError, match=said):
         keywords.configured("point-mass-vary-goal", agent, given, plan=plan)
     run_config.parse(["--env=point-mass-vary-goal", "--agent=sac"])
+
+
+_REDO = {"encoder": "identity", "unit_head": False, "plasticity": "redo"}
+
+
+@pytest.mark.parametrize(
+    ("agent", "given"),
+    [
+        ("sac", {"scaling": "ars", "reset_every": 1000}),
+        ("simba-v2", _REDO),
+        ("drq", {"pixels": 32, "n_step": 1, "conditioning": "recurrent", "representation": "plain"}),
+        ("drq", {"pixels": 32, "n_step": 1, "target": "retrace"}),
+        ("drq", {"pixels": 32, "n_step": 1, "representation": "deepmdp"}),
+        ("rl2", {"minibatches": 3, "unroll": 16}),
+        ("sac", {"hidden": (8, 8, 8), "tune": "all", "combine": "grid", "split": "none", "stagger": False}),
+    ],
+)
+def test_a_command_and_keywords_make_one_configuration(agent, given):
+    """Settings are checked together with those of which the agent's own default is refused."""
+    made = keywords.configured("cheetah-run-vary-torso-length", agent, given, plan={"steps": 3000})
+    words = [word for name, value in given.items() for word in _as_words(made, name, value)]
+    said = run_config.parse(["--env=cheetah-run-vary-torso-length", f"--agent={agent}", "--steps=3000", *words])
+    assert said == made
+
+
+def _as_words(config, name, value):
+    """Return a setting as words of a command line."""
+    flag = name.replace("_", "-")
+    flag = next(each for each in run_config.flags(config) if re.fullmatch(rf"--((env|agent)\.)?{flag}", each))
+    if isinstance(value, bool):
+        return [flag if value else switched_off(flag)]
+    return [flag, *map(str, value)] if isinstance(value, tuple) else [f"{flag}={value}"]
+
+
+def test_evaluations_that_are_given_stay():
+    """Though they are the usual ones; else a short run has fewer, of whole trials."""
+    plan_of = lambda given, **plan: keywords.configured("finger-spin", "sac", given, plan={"steps": 9000} | plan).plan
+    assert plan_of({"trials": 3}).eval_episodes == 12
+    assert plan_of({}).eval_every == 4500
+    assert plan_of({}, eval_every=0).eval_every == 0
 
 
 def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
@@ -248,7 +291,7 @@ WRONG = [
     ((ENV, "sac"), {"sweep": {"num_critics": [1, 2]}}, "num_critics cannot vary inside one program; train once"),
     ((ENV, "sac"), {"start": "nowhere"}, "'nowhere' is not a run"),
     ((ENV, "drq"), {}, "give pixels=64, or for states use agent='sac-conditioned', to which representation='encoded'"),
-    ((ENV, "sac"), {"tune": "critics"}, "tune='critics' leaves the rest as a run left it; say which run: start=RUN"),
+    ((ENV, "sac"), {"tune": "heads"}, "tune='heads' leaves the rest as a run left it; say which run: start=RUN"),
     ((ENV, "sac"), {"on_chunk": 3}, "on_chunk is a function of a row of metrics, not 3"),
     ((Probe("delayed"), tiny("sac")), {"directory": "x"}, "an environment derived from Family"),
 ]
@@ -274,6 +317,7 @@ def test_a_command_names_its_flags():
     "flags, arguments",
     [
         ("use --engine=c or --engine=warp", "use engine='c' or engine='warp'"),
+        ("use --agent.unit-head=false", "use unit_head=False"),
         ("lower --replay-size, --num-envs or --seeds.", "lower replay_size, num_envs or seeds."),
         ("or choose another place with --runs", "or choose another place with directory"),
         ("leave out --env.pixels and --agent.encoder-tau=0.5.", "leave out pixels and encoder_tau=0.5."),

@@ -512,7 +512,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--agent=care --agent.conditioning=none", "conditioning cannot be none"),
         ("--agent=brc --agent.scaling=none", "and --agent.scaling=none does not keep them there; use --agent.scaling="),
         ("--agent.conditioning=vectors", "go together"),
-        ("--agent.vectors=x.npy", "it belongs to conditioning='vectors'"),
+        ("--agent.vectors=x.npy", "it belongs to --agent.conditioning=vectors"),
         ("--agent.conditioning=vectors", "go together"),
         ("--agent.conditioning=vectors --agent.vectors=missing.npy", "cannot read task vectors from 'missing.npy'"),
         ("--seeds=99999999999999999999", "seeds must be at most 100000, not 99999999999999999999"),

@@ -151,9 +151,8 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
     real = {"--help": False, "--import": False} | {f"--agent.{kind}": False for kind in CHOICES}
     real |= run_config.flags(mtjax.preset("cartpole-swingup+finger-spin", "sac"))
     for cls in {cls for cls, _ in ENVS.values()} | set(map(load, SUITES.values())):
-        for field in run_config.shared_fields(cls):
-            flag = run_config.family_flag(field.name)
-            real[flag] = real.get(flag, False) or isinstance(field.default, bool)
+        for flag, (_, kind) in run_config.setting_flags(cls, "env").items():
+            real[flag] = real.get(flag, False) or kind is bool
     for agent, given in itertools.product(
         ("sac", "distral", "brc", "simba-v2", "xqc", "ppo", "impala", "pqn", "sketches", "options", "maml", "distil"),
         [{}, *choices],

@@ -253,6 +253,7 @@ def test_sweeps_are_read_out_of_a_command_line(words, found, rest):
         (["--sweep", "agent.num-critics=1,0"], "num-critics must be greater than 0, not 0"),
         (["--sweep", "agent.cagrad-radius=0.1,0.2"], "unknown number of this agent 'cagrad_radius'"),
         (["--sweep", "agent.nonsense=1,2"], "unknown flag"),
+        (["--agent.discounting=horizon", "--sweep", "agent.gamma=0.9,0.99"], "gamma changes nothing; leave it out"),
         (["--sweep", "agent.encoder=film,flim"], "did you mean 'film'?"),
         (["--sweep", "agent.tau=0.1", "--resume=x"], "leave out --sweep"),
     ],

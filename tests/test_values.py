@@ -9,7 +9,7 @@ import pytest
 from probes import LEARNING, Probe, only_seed, tasks_of, tiny, train, values
 
 import mtjax
-from mtjax.agents import agent
+from mtjax.agents import AGENTS, agent
 from mtjax.agents.hyperparameters import require_value_range
 from mtjax.agents.parts.values import C51, VALUES, HLGauss, Scalar
 from mtjax.command.run_config import parse
@@ -158,7 +158,7 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 def test_returns_must_be_scaled_to_a_range_that_nobody_chose():
     """Before anything compiles, by the program too; at every point of a sweep."""
     for name, settings in (("sac", {"value": "c51"}), ("sac", {"value": "hl-gauss", "scaling": "reward"})):
-        with pytest.raises(InputError, match=f"value={settings['value']} reaches returns from -10 to 10.*=return, or"):
+        with pytest.raises(InputError, match=f"value={settings['value']} reaches returns from -10 to 10.*=return w"):
             mtjax.train(Probe("delayed"), agent(name, **settings), steps=10)
     sweep = {"value_high": [20.0, 10.0]}
     with pytest.raises(InputError, match="value=c51 reaches returns from -10 to 10"):
@@ -167,10 +167,31 @@ def test_returns_must_be_scaled_to_a_range_that_nobody_chose():
         launch.check(parse(["--env=pendulum-swingup", "--engine=mjx", "--agent=brc", "--agent.scaling=none"]))
 
 
+@pytest.mark.parametrize(
+    "name, settings, said",
+    [
+        ("xqc", {"scaling": "none"}, "from -5 to 5, and scaling=none does.*use scaling=return with return-range=5, or"),
+        ("simba-v2", {"scaling": "reward"}, "from -5 to 5, and scaling=reward does"),
+        ("simba-v2", {"scaling": "none", "value": "hl-gauss"}, "from -10 to 10, and scaling=none does"),
+        ("xqc", {"scaling": "return"}, "and scaling=return with return-range=10 does.*use return-range=5"),
+        ("brc", {"return_range": 100.0}, "from -10 to 10, and scaling=return with return-range=100"),
+    ],
+)
+def test_returns_that_would_saturate_a_distribution_are_refused(name, settings, said):
+    """In agents whose own range is another than that of the values' class, and where returns are scaled too far."""
+    with pytest.raises(InputError, match=said):
+        require_value_range(agent(name, **settings))
+
+
 def test_a_range_that_is_given_or_scaled_to_is_taken():
     """Given on a command line too, where a part has its settings after its name."""
     for settings in ({"value": "c51", "value_high": 200.0}, {"value": "hl-gauss", "scaling": "return"}, {}):
         require_value_range(agent("sac", **settings))
+    of_gains = {"scaling": "return", "value_low": 0.0, "value_high": 10.0}  # of which none is negative
+    for settings in (of_gains, {"scaling": "return", "return_range": 5.0}, {"scaling": "none", "value_high": 200.0}):
+        require_value_range(agent("xqc", **settings))
+    for name in AGENTS:
+        require_value_range(agent(name))
     words = ["--env=pendulum-swingup", "--agent=sac", "--agent.value=c51", "--agent.value-high=200"]
     require_value_range(parse(words).learner)
 

@@ -14,7 +14,7 @@ import tyro
 from mtjax.agents import combinations, parts
 from mtjax.agents.beginning import Beginning
 from mtjax.agents.fit import Fit, Losses
-from mtjax.agents.hyperparameters import FLAT, PARTS, kinds_of
+from mtjax.agents.hyperparameters import FLAT, parts_of
 from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.encoders import Encoder
@@ -31,7 +31,7 @@ from mtjax.agents.parts.watching import Watcher
 from mtjax.agents.rates import discounts, discounts_of_all, scheduled
 from mtjax.agents.state import AgentState, Nets, of_task
 from mtjax.agents.view import View, init_inputs, join_arrays
-from mtjax.checks import require_values
+from mtjax.checks import require_choices, require_values
 from mtjax.experience import Replay
 from mtjax.parallel import collectives
 from mtjax.types import Acted, Array, Key, Metrics, Spec, Task, Transition
@@ -200,10 +200,11 @@ class BaseAgent(abc.ABC):
         Raises:
             InputError: they cannot.
         """
-        for kind in kinds_of(self):
-            object.__setattr__(self, kind, parts.choose(kind, PARTS[kind], getattr(self, kind)))
-        parts.require_choices(self)
-        for holder in (self, *(getattr(self, kind) for kind in kinds_of(self))):
+        chosen = parts_of(self)
+        for kind, part in chosen.items():
+            object.__setattr__(self, kind, part)
+        for holder in (self, *chosen.values()):
+            require_choices(holder)
             require_values(holder)
         combinations.check(self)
 

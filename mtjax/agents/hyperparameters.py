@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, TypeVar, get_type_hints
 
 import tyro
@@ -46,6 +47,15 @@ def kinds_of(agent: Any) -> list[str]:
     return [field.name for field in dataclasses.fields(agent) if field.name in PARTS]
 
 
+def parts_of(agent: Any, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """Return an agent's parts by kind, with those that ``given`` has, by name or as they are, in place of its own.
+
+    Raises:
+        InputError: no part of a kind has that name.
+    """
+    return {kind: parts.choose(kind, PARTS[kind], given.get(kind, getattr(agent, kind))) for kind in kinds_of(agent)}
+
+
 def flag_names(agent: Any) -> dict[str, str]:
     """Map the name of each of an agent's settings to its command-line flag, without dashes."""
     bare = {name for holder in (agent, agent.experience) for name in _unprefixed(type(holder))}
@@ -74,9 +84,8 @@ def replace(agent: Any, given: Mapping[str, Any]) -> Any:
     Raises:
         InputError: it has no such setting, or the value is not allowed.
     """
-    rest = frozen(given)
-    choose = lambda kind: parts.choose(kind, PARTS[kind], rest.pop(kind)) if kind in rest else getattr(agent, kind)
-    chosen = {kind: choose(kind) for kind in kinds_of(agent)}
+    chosen = parts_of(agent, given)
+    rest = {name: value for name, value in frozen(given).items() if name not in chosen}
     known = {name for holder in (agent, *chosen.values()) for name in parts.setting_names(holder)}
     unknown = next((name for name in rest if name not in known), None)
     if unknown is not None:
@@ -91,15 +100,16 @@ def for_action(agent: A, action: Action) -> A:
 
 
 def require_value_range(agent: Any) -> None:
-    """Refuse categorical critics that have no chosen range and whose returns are not scaled to the default range.
+    """Refuse categorical critics whose range is smaller than that of scaled returns, or nobody's choice without one.
 
     Raises:
         InputError: the agent has such critics.
     """
-    if "value" in kinds_of(agent) and not agent.scaling.fits_returns:
-        reason = agent.value.refuses(parts.name_of(SCALINGS, agent.scaling))
-        if reason:
-            raise InputError(f"value={parts.name_of(VALUES, agent.value)} {reason}")
+    if "value" not in kinds_of(agent):
+        return
+    usual, scaling = type(agent).__dataclass_fields__["value"].default_factory(), agent.scaling
+    if reason := agent.value.refuses(parts.name_of(SCALINGS, scaling), scaling.return_range, usual):
+        raise InputError(f"value={parts.name_of(VALUES, agent.value)} {reason}")
 
 
 def build(name: str, cls: type, defaults: Mapping[str, Any], given: Mapping[str, Any]) -> Any:

@@ -41,6 +41,8 @@ def agent_at(agent: BaseAgent, point: Point) -> BaseAgent:
         raise InputError(f"{unknown} cannot vary inside one program; train once for each value, as --sweep does")
     if unknown is not None:
         raise nearest_error("number of this agent", unknown, known)
+    if "gamma" in point and agent.discounting == "horizon":  # where a preset's gamma has no effect either
+        raise InputError("discounting=horizon takes discounts from horizons, and gamma changes nothing; leave it out")
     return _replace_values(agent, point, dataclasses.replace)
 
 

@@ -42,8 +42,8 @@ def train(
     steps: int | None = None,
     seeds: int = Plan.seeds,
     seed: int = Plan.seed,
-    eval_every: int = Plan.eval_every,
-    eval_episodes: int = Plan.eval_episodes,
+    eval_every: int | None = None,
+    eval_episodes: int | None = None,
     eval_sampled: bool = Plan.eval_sampled,
     population: str = Plan.population,
     settings: Settings | None = None,
@@ -74,8 +74,10 @@ def train(
             worlds, in chunks of one length. None takes the preset's if both are names, else a million.
         seeds: how many seeds to train at once.
         seed: the first seed.
-        eval_every: environment steps between evaluations. 0 means ten evaluations in the run.
-        eval_episodes: episodes of each task in every evaluation.
+        eval_every: environment steps between evaluations. 0 means ten evaluations in the run. So does None, but fewer
+            in a short run of an agent given by name.
+        eval_episodes: episodes of each task in every evaluation. None means ten, and for an agent given by name rounded
+            up to whole trials.
         eval_sampled: draw the actions of evaluations from the policy; else they are its mean ones, or the likeliest
             choices.
         population: "pbt:STEPS" or "halving:STEPS" makes a population of all seeds of all points of ``sweep``, as
@@ -116,9 +118,9 @@ def train(
     if directory is None and (resume or any(written.values())):
         names = ", ".join(["resume", *written])
         raise InputError(f"{names} need the run's folder; give directory as well")
-    plan = {"seeds": seeds, "seed": seed, "eval_every": eval_every, "eval_episodes": eval_episodes}
-    plan |= {"eval_sampled": eval_sampled, "population": population}
-    plan |= {} if steps is None else {"steps": steps}
+    plan = {"seeds": seeds, "seed": seed, "eval_sampled": eval_sampled, "population": population}
+    may_be_none = {"steps": steps, "eval_every": eval_every, "eval_episodes": eval_episodes}
+    plan |= {name: value for name, value in may_be_none.items() if value is not None}
     if agent is None and begun is not None:
         agent = (begun if isinstance(begun, Policy) else begun[0]).agent
     config = configured(env, agent, given, plan=plan, settings=settings, start=begun, sweep=sweep, **written)

@@ -7,8 +7,7 @@ from typing import Any
 from mtjax import agents
 from mtjax.agents import BaseAgent, parts, swept
 from mtjax.agents.beginning import Beginning, beginning
-from mtjax.agents.hyperparameters import PARTS, unknown_setting
-from mtjax.agents.hyperparameters import settings as settings_of
+from mtjax.agents.hyperparameters import parts_of, unknown_setting
 from mtjax.agents.swept import Sweep
 from mtjax.checks import shown
 from mtjax.config import Plan, RunConfig, configure, describe_teacher, fit_length, own_files, with_preset
@@ -38,7 +37,7 @@ def configured(
 
     Args:
         given: settings of the loop, of the agent or its parts, and of an environment that is given by name.
-        plan: the fields of ``Plan``.
+        plan: the fields of ``Plan`` that are given.
         settings: settings of the training loop; by default those of the preset, or ``Settings()`` for an object.
         start: the policy to fine-tune, or those that teach.
         written: profile, tensorboard, wandb and trackio.
@@ -62,7 +61,7 @@ def configured(
         of_loop = {**(vars(settings) if settings else {}), **{x: rest[x] for x in rest.keys() - of_agent}}
         config = with_preset(name, agent, "auto", {**(begun.settings if begun else {}), **of_agent}, family, of_loop)
         length = dataclasses.replace(config.plan if isinstance(env, str) else Plan(), **plan)
-        chosen = {x for x in plan if plan[x] != getattr(Plan, x)} | {*given, *(_names(Settings) if settings else ())}
+        chosen = {*plan, *given, *(_names(Settings) if settings else ())}
         config = fit_length(dataclasses.replace(config, plan=length), chosen)
     else:
         learner, training = configure(agent, settings or Settings(), rest)
@@ -121,9 +120,7 @@ def _names(cls: Any) -> list[str]:
 def _require_known(given: Mapping[str, Any], agent: Any, env_name: str, family: Any, by_name: bool) -> None:
     """Refuse a keyword that the agent does not have, and say where it belongs."""
     agent = agents.agent(agent) if isinstance(agent, str) else agent
-    known = set(settings_of(agent))
-    for kind in (name for name in given if name in known and isinstance(given[name], str) and name in PARTS):
-        known |= set(parts.setting_names(parts.choose(kind, PARTS[kind], given[kind])))
+    known = {name for holder in (agent, *parts_of(agent, given).values()) for name in parts.setting_names(holder)}
     unknown = next((name for name in given if name not in known), None)
     if unknown is None:
         return

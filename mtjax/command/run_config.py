@@ -3,26 +3,27 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
-from mtjax.agents import preset_of, settings
+import tyro
+
+from mtjax.agents import agent, preset_of, settings
 from mtjax.agents.beginning import beginning
-from mtjax.agents.hyperparameters import CHOICES, flag_names, owners
+from mtjax.agents.hyperparameters import CHOICES, owners, parts_of, replace
 from mtjax.command.class_sources import all_flags
 from mtjax.command.flags import flag_value, plain_values, split_flags, switched_off, switched_on, vary_flags, with_port
 from mtjax.command.imports import import_files, imports_of
 from mtjax.command.parsing import parse_with_tyro
 from mtjax.command.refusals import check_names, unknown_flag
 from mtjax.config import NO_FINE_TUNING, RunConfig, describe_teacher, fit_length, own_files, with_preset
-from mtjax.envs import ENVS, is_mixture, make, require_pictures
+from mtjax.envs import make, require_pictures
 from mtjax.envs.family import Family
-from mtjax.envs.mixtures import Mixture, require_family
+from mtjax.envs.mixtures import require_family
+from mtjax.learning.loop import Settings
 from mtjax.names import InputError
 from mtjax.saved.config_json import from_json
 
-_NO_FLAGS = ("vary", "context-ranges", "points", "teacher", "imports")  # vary has one for each parameter, taken out
-_FAMILY_FLAGS = {"combine": "env.combine", "split": "split"}  # they decide which values are allowed
-_DECIDING = ("vectors", "heads", "actor-heads", "critic-heads", "lr-schedule")  # they decide which parts are allowed
+_PROGRAM = "python -m mtjax.train"
 
 
 def parse(argv: Sequence[str]) -> RunConfig:
@@ -50,43 +51,27 @@ def draft(argv: Sequence[str]) -> RunConfig:
     sources = _sources(start, flag_value(argv, "agent", "")) if start or "--from=" in argv else []
     agent_name = flag_value(argv, "agent", sources[0].agent if sources else RunConfig.agent)
     preset_name = flag_value(argv, "preset", RunConfig.preset)
+    named = {name for word in argv if (name := _name(word))}
+    begun = beginning(preset_of(agent_name).cls, sources[0].learner, sources[0].family) if sources else None
+    goes_on = bool(sources) and begun is None and not preset_of(agent_name).cls.taught
     vary, argv = vary_flags(argv)
     chosen, argv = _peel_parts(argv)
-    of_family: dict[str, Any] = {
-        name: value for name in ("combine", "split") if (value := flag_value(argv, _FAMILY_FLAGS[name], ""))
-    }
-    for name in ("pixels", "num_tasks"):  # from pictures agents have other defaults, and with other numbers of tasks
-        value = flag_value(argv, f"env.{name.replace('_', '-')}", "")
-        if value.isdecimal():
-            of_family[name] = int(value)
-    if is_mixture(env_name):
-        of_family, argv = _peel_shared(argv, make(env_name))
-    elif "--env.pictures" in argv and hasattr(ENVS[env_name][0], "pictures"):
-        of_family["pictures"] = True
-    given = {name.replace("-", "_"): flag_value(argv, f"agent.{name}", "") for name in _DECIDING}
-    deciding: dict[str, Any] = {name: value for name, value in given.items() if value}
-    if switched_off("--agent.normalize-observations") in argv:  # which presets switch on, and some parts refuse
-        deciding["normalize_observations"] = False
-    begun = beginning(preset_of(agent_name).cls, sources[0].learner, sources[0].family) if sources else None
-    of_agent = {**({} if begun is None else begun.settings), **chosen, **deciding}
-    of_loop = _of_loop(argv)
-    default = with_preset(env_name, agent_name, preset_name, of_agent, None, of_loop, vary=vary, **of_family)
-    if sources and begun is None:
-        taught = preset_of(agent_name).cls.taught
-        default = _distilling(default, sources) if taught else _fine_tuning(default, sources[0], chosen)
+    parts = {**(begun.settings if begun else {}), **chosen}
+    own = sources[0].learner if goes_on else agent(agent_name)
+    of_family, argv = _read(argv, [part.family for part in make(env_name).parts], "env")
+    of_agent, argv = _read(argv, [own, *parts_of(own, parts).values()], "agent")
+    of_loop, argv = _read(argv, [Settings()], "")
+    given = parts if goes_on else parts | of_agent
+    default = with_preset(env_name, agent_name, preset_name, given, None, of_loop, vary=vary, **of_family)
+    if goes_on:
+        default = _fine_tuning(default, sources[0], chosen, of_agent)
+    elif sources and begun is None:
+        default = _distilling(default, sources)
     default = dataclasses.replace(default, start=start)
     _check_flags(argv, default)
-    config = parse_with_tyro(RunConfig, argv, default, "python -m mtjax.train")
-    config = fit_length(config, {name for word in argv if (name := _name(word))})
+    config = fit_length(parse_with_tyro(RunConfig, argv, default, _PROGRAM), named)
     config = dataclasses.replace(config, imports=tuple(files))
     return dataclasses.replace(config, imports=own_files(config))
-
-
-def _of_loop(argv: Sequence[str]) -> dict[str, Any]:
-    """Return those settings of the loop on a command line to which presets are fitted."""
-    curriculum, worlds = flag_value(argv, "curriculum", ""), flag_value(argv, "num-envs", "")
-    given: dict[str, Any] = {"curriculum": curriculum} if curriculum else {}
-    return given | ({"num_envs": int(worlds)} if worlds.isdecimal() else {})
 
 
 def _name(word: str) -> str:
@@ -115,7 +100,9 @@ def _distilling(config: RunConfig, sources: Sequence[RunConfig]) -> RunConfig:
     return dataclasses.replace(config, family=family, teacher=describe_teacher(source.learner, *sizes))
 
 
-def _fine_tuning(config: RunConfig, source: RunConfig, chosen: Mapping[str, str]) -> RunConfig:
+def _fine_tuning(
+    config: RunConfig, source: RunConfig, chosen: Mapping[str, str], of_agent: Mapping[str, Any]
+) -> RunConfig:
     """Return a configuration with the agent of the run ``source``, and tasks whose context is scaled as there."""
     had = {"agent": source.agent, **settings(source.learner)}
     for name, given in {"agent": config.agent, **chosen}.items():
@@ -124,8 +111,8 @@ def _fine_tuning(config: RunConfig, source: RunConfig, chosen: Mapping[str, str]
     for env in (config.family, source.family):
         require_family(env, NO_FINE_TUNING)
     assert isinstance(config.family, Family) and isinstance(source.family, Family)
-    learner, family = dataclasses.replace(source.learner, tune="all"), config.family.scaled_as(source.family)
-    return dataclasses.replace(config, learner=learner, family=family)
+    learner = replace(source.learner, {"tune": "all", **of_agent})
+    return dataclasses.replace(config, learner=learner, family=config.family.scaled_as(source.family))
 
 
 def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
@@ -135,59 +122,53 @@ def _peel_parts(argv: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     return {kinds[flag]: name for flag, name in given.items()}, rest
 
 
-def _peel_shared(argv: Sequence[str], mixture: Mixture) -> tuple[dict[str, Any], list[str]]:
-    """Take the flags that hold for every family of a mixture out of a command line, and read their values."""
-    fields = {f.name: (f.type, getattr(family, f.name)) for family in mixture.families for f in shared_fields(family)}
-    known = {family_flag(name): name for name in fields}
-    known |= {switched_off(flag): name for flag, name in known.items()}
-    given, words, rest = {}, [], []
-    name = None
+def _read(argv: Sequence[str], holders: Sequence[Any], group: str) -> tuple[dict[str, Any], list[str]]:
+    """Take the flags of dataclasses' settings out of a command line, and read their values by name."""
+    known = {flag: (*found, x) for x in holders for flag, found in setting_flags(type(x), group).items()}
+    known |= {switched_off(flag): found for flag, found in known.items()}
+    types, defaults, words, rest, mine = {}, {}, [], [], False
     for word in argv:
         if word.startswith("--"):
-            flag, equals, value = word.partition("=")
-            name = known.get(flag)
-            if name is not None:
-                kind, default = fields[name]
-                given[name] = (name, kind, dataclasses.field(default=default))
-                word = f"--{flag.removeprefix('--').rpartition('.')[2]}{equals}{value}"
-        (rest if name is None else words).append(word)
-    if not given:
+            flag = word.partition("=")[0]
+            mine = flag in known
+            if mine:
+                name, kind, holder = known[flag]
+                types[name], defaults[name] = kind, getattr(holder, name)
+        (words if mine else rest).append(word)
+    if not types:
         return {}, rest
-    shared = dataclasses.make_dataclass("Shared", given.values(), frozen=True)
-    return dataclasses.asdict(parse_with_tyro(shared, words, shared(), "python -m mtjax.train")), rest
+    made: Any = dataclasses.make_dataclass("Given", types.items(), frozen=True)
+    learner = ("learner", Annotated[made, tyro.conf.arg(name=group)])
+    grouped = dataclasses.make_dataclass("Grouped", [learner], frozen=True)
+    return vars(parse_with_tyro(grouped, words, grouped(made(**defaults)), _PROGRAM).learner), rest
 
 
-def shared_fields(family: Family) -> list[dataclasses.Field]:
-    """Return the fields of a family that are command-line flags."""
-    return [field for field in dataclasses.fields(family) if field.name not in ("vary", "context_ranges")]
+def setting_flags(cls: type, group: str) -> dict[str, tuple[str, Any]]:
+    """Return the names and types of a dataclass's settings by their flags, which are in a group or in none."""
+    found = {}
+    hints = get_type_hints(cls, include_extras=True)
+    for field in dataclasses.fields(cls):
+        marks = getattr(hints[field.name], "__metadata__", ())
+        names = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
+        bare = not group or any(getattr(mark, "prefix_name", None) is False for mark in marks)
+        name = next(iter(names), field.name.replace("_", "-"))
+        if name and tyro.conf.Suppress not in marks:
+            found[f"--{name}" if bare else f"--{group}.{name}"] = (field.name, hints[field.name])
+    return found
 
 
-def family_flag(name: str) -> str:
-    """Return the command-line flag of a family's field."""
-    flag = name.replace("_", "-")
-    return f"--{flag}" if flag in ("split", "engine") else f"--env.{flag}"
-
-
-def flags(config: Any, prefix: str = "--") -> dict[str, bool]:
+def flags(config: RunConfig) -> dict[str, bool]:
     """Return every flag of a configuration, and whether it is a switch."""
-    found: dict[str, bool] = {}
-    for field in dataclasses.fields(config):
-        value, name = getattr(config, field.name), field.name.replace("_", "-")
-        if name in _NO_FLAGS:
-            continue
-        if name == "learner":
-            found |= {f"--{flag}": isinstance(settings(value)[name], bool) for name, flag in flag_names(value).items()}
-            continue
-        if isinstance(value, Mixture):
-            shared = {f.name: getattr(family, f.name) for family in value.families for f in shared_fields(family)}
-            found |= {family_flag(each): isinstance(x, bool) for each, x in {"scenes": "", **shared}.items()}
-            continue
-        group = {"plan": "--", "training": "--", "family": "--env."}.get(field.name)
-        if group is not None:
-            found |= flags(value, group)
-        else:
-            name = "from" if name == "start" else name
-            found[f"--{name}" if name in ("split", "engine") else f"{prefix}{name}"] = isinstance(value, bool)
+    groups = {
+        "": [config, config.plan, config.training],
+        "env": [config.family, *(part.family for part in config.family.parts)],
+        "agent": [config.learner, *parts_of(config.learner).values()],
+    }
+    found = {f"--agent.{kind}": False for kind in parts_of(config.learner) if kind in CHOICES}
+    for group, members in groups.items():
+        for member in members:
+            for flag, (name, _) in setting_flags(type(member), group).items():
+                found[flag] = isinstance(getattr(member, name), bool)
     return found
 
 

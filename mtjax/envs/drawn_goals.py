@@ -2,7 +2,9 @@
 
 import dataclasses
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
+
+import tyro
 
 from mtjax.envs.variation import Variation
 from mtjax.names import nearest_error
@@ -14,7 +16,7 @@ _REWARDS = ("dense", "sparse")
 class DrawnGoals:
     """What such a family has. Derive from this first: ``class Mine(DrawnGoals, Pictured, Family)``."""
 
-    context_ranges: Any = ()
+    context_ranges: Annotated[Any, tyro.conf.Suppress] = ()
     reward_kind: str = "dense"
     """dense: rewards show the way; or sparse: only where all is where it should be."""
 

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from mtjax.experience import hindsight, multistep, pictures, store
 from mtjax.experience import ring as rings
 from mtjax.experience.ring import OVER_SEEDS, Ring
 from mtjax.frames import PICTURES, shown
-from mtjax.names import nearest_error
 from mtjax.parallel import collectives
 from mtjax.types import Array, Env, InputError, Key, Spec, Storage, Task, Transition
 
@@ -84,12 +83,8 @@ class Replay:
     def __post_init__(self):
         if not 0 <= self.hindsight <= 1:
             raise InputError(f"hindsight is a share from 0 to 1, not {self.hindsight}")
-        if self.hindsight_choice not in get_args(HindsightChoice):
-            raise nearest_error("hindsight-choice", self.hindsight_choice, get_args(HindsightChoice))
-        if self.hindsight_choice != "uniform" and not self.hindsight:
-            raise InputError(
-                f"hindsight-choice={self.hindsight_choice} relabels nothing with hindsight=0; give its share"
-            )
+        if self.hindsight_choice == "inverse" and not self.hindsight:
+            raise InputError("hindsight-choice=inverse relabels nothing with hindsight=0; give its share")
         others = [field.name for field in dataclasses.fields(self) if field.name not in _MAY_BE_NONE]
         require_counts(self, *(name for name in others if name != "hindsight_choice"))
         require_not_negative(self, *_MAY_BE_NONE)

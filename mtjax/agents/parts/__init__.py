@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.checks import checked, shown
-from mtjax.checks import require_choices as require_choices  # re-exported for parts of one's own, as are the next
-from mtjax.checks import require_counts as require_counts
+from mtjax.checks import require_counts as require_counts  # re-exported for parts of one's own, as are the next
 from mtjax.checks import require_layers as require_layers
 from mtjax.checks import require_not_negative as require_not_negative
 from mtjax.checks import require_positive as require_positive

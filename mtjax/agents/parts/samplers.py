@@ -218,7 +218,6 @@ class ByTemperature(Uniform):
     """Take the softmax of the negative log temperatures (the authors' code) or negative temperatures (the paper)."""
 
     def __post_init__(self):
-        parts.require_choices(self)
         parts.require_shares(self, "least_weight")
 
     def weights(self, memory: Any, temperature: Array) -> Array:

@@ -21,8 +21,13 @@ class Scalar:
     linear: ClassVar[bool] = True
     """Whether values are linear in a critic's outputs, so that its head can be rescaled."""
 
-    def refuses(self, scaling: str) -> str:
-        """Return why this kind of value cannot work with a scaling that keeps returns in no range; empty if it can."""
+    def refuses(self, scaling: str, largest: float | None, usual: "Scalar") -> str:
+        """Return why this kind of value cannot work with the scaling of that name; empty if it can.
+
+        Args:
+            largest: absolute return after scaling, or None if the scaling keeps returns in no range.
+            usual: the value that the agent has if none is given.
+        """
         return ""
 
     @property
@@ -64,8 +69,8 @@ class C51(Scalar):
     With several critics, p is for each sample the distribution of least mean, or the mean of all distributions.
 
     Differs from the paper: a soft value's bonus shifts the atoms, and the policy is the actor's, as in BRC (Nauman et
-    al. 2025). The default range is BRC's, which fits returns under scaling=return. Without that scaling a range must be
-    given, as the critic cannot represent returns beyond it.
+    al. 2025). The default range is BRC's, which fits returns under scaling=return. Without a scaling that keeps
+    returns in a range one must be given, as the critic cannot represent returns beyond it.
     """
 
     linear: ClassVar[bool] = False
@@ -82,12 +87,16 @@ class C51(Scalar):
         if not -np.inf < self.value_low < self.value_high < np.inf:
             raise InputError(f"value-low must be below value-high, not {self.value_low} and {self.value_high}")
 
-    def refuses(self, scaling: str) -> str:
-        if (self.value_low, self.value_high) != (C51.value_low, C51.value_high):
+    def refuses(self, scaling: str, largest: float | None, usual: Scalar) -> str:
+        low, high = self.value_low, self.value_high
+        furthest = max(-low, high)  # where no reward is negative, value-low may be 0
+        unchosen = [(x.value_low, x.value_high) for x in (type(self), usual) if hasattr(x, "value_low")]
+        if (low, high) not in unchosen if largest is None else largest <= furthest:
             return ""
+        told, use = ("", "scaling=return with ") if largest is None else (f" with return-range={largest:g}", "")
         return (
-            f"reaches returns from {self.value_low:g} to {self.value_high:g}, and scaling={scaling} does not keep them "
-            "there; use scaling=return, or give a value-low and value-high that they fit"
+            f"reaches returns from {low:g} to {high:g}, and scaling={scaling}{told} does not keep them there; use "
+            f"{use}return-range={furthest:g}, or give a value-low and value-high that they fit"
         )
 
     @property

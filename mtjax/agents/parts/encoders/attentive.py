@@ -63,7 +63,6 @@ class Attentive(Identity):
     """Widths of the hidden layers from state and task to the weights; without any, scores are linear."""
 
     def __post_init__(self):
-        super().__post_init__()
         parts.require_counts(self, "num_subnetworks")
         parts.require_widths(self, "attention_widths")
 

@@ -22,9 +22,6 @@ class Identity:
     needs_features: ClassVar[bool] = False  # if so, conditioning=none is refused
     has_statistics: ClassVar[bool] = False  # if so, only agents that keep running statistics of batches take it
 
-    def __post_init__(self):
-        parts.require_choices(self)
-
     def refuses(self, conditioning: Knowing, otherwise: bool) -> str:
         """Return why the encoder cannot work with a conditioning; empty if it can.
 
@@ -72,7 +69,6 @@ class MLPEncoder(Identity):
     """Widths of the encoder's layers; the last is the size of the encoding."""
 
     def __post_init__(self):
-        super().__post_init__()
         parts.require_layers(self, "encoder_widths")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:

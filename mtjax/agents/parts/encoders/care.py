@@ -83,7 +83,6 @@ class CARE(Identity):
     """Scale encodings and context to length 1 before the paper's inner products, so that scores stay bounded."""
 
     def __post_init__(self):
-        super().__post_init__()
         parts.require_not_negative(self, "attention_temperature")
         check_experts(self.num_experts, self.expert_widths)
         if self.unit_attention and self.variant == "mtrl":

@@ -72,7 +72,6 @@ class FiLM(Identity):
     """Widths of the hidden layers in the network of scales and shifts; without any it is linear."""
 
     def __post_init__(self):
-        super().__post_init__()
         parts.require_widths(self, "film_widths")
 
     def body(self, hidden: tuple[int, ...], layer_norm: bool) -> nn.Module:

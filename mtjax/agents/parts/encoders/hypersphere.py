@@ -80,7 +80,6 @@ class Hypersphere(Identity):
     """Constant that is put beside the inputs before their length becomes 1."""
 
     def __post_init__(self):
-        super().__post_init__()
         parts.require_counts(self, "expansion")
         parts.require_positive(self, "input_shift")
 

@@ -154,7 +154,6 @@ class MoE(Identity):
     """The expert of every training task, numbered from 0, for mode=cluster."""
 
     def __post_init__(self):
-        super().__post_init__()
         check_experts(self.num_experts, self.expert_widths)
         if self.mode == "top-k" and not 2 <= self.top_k <= self.num_experts:
             raise InputError(f"top-k must be from 2 to num-experts={self.num_experts}, not {self.top_k}")

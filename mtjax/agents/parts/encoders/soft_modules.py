@@ -118,7 +118,6 @@ class SoftModules(Identity):
     """Widths of the layers that embed the routing's input in the official variant."""
 
     def __post_init__(self):
-        super().__post_init__()
         if self.num_layers < 2:
             raise InputError(f"num-layers must be at least 2, as weights lie between layers, not {self.num_layers}")
         if min(self.num_modules, self.module_width, *self.routing_widths) < 1:

@@ -67,7 +67,6 @@ class Posterior(Remembering):
 
     def __post_init__(self):
         super().__post_init__()
-        parts.require_choices(self)
         parts.require_counts(self, "latent_size", "recurrent_size", "inferred_from", "decoded_steps")
         parts.require_layers(self, "inference_widths")
         parts.require_not_negative(self, "kl_coefficient", "state_coefficient", "backward_coefficient")

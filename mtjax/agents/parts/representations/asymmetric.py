@@ -41,7 +41,6 @@ class Asymmetric(Plain):
     sees_pictures: ClassVar[bool] = True
 
     def __post_init__(self):
-        super().__post_init__()
         parts.require_layers(self, "latent_widths")
         parts.require_not_negative(self, "shift")
 

@@ -8,7 +8,6 @@ import flax.linen as nn
 import jax
 
 from mtjax import frames
-from mtjax.agents import parts
 from mtjax.agents.networks import Params
 from mtjax.agents.parts.knowing.last_steps import without_past
 from mtjax.types import Array, InputError, Key, Metrics, Transition
@@ -42,9 +41,6 @@ class Plain:
     least_loss: ClassVar[float | Array] = 0.0  # lower bound of what its losses add to the critics' loss
     sight: ClassVar[nn.Module | None] = None  # of the actor's own: maps observations with pictures to vectors
     unseen: ClassVar[Unseen] = Unseen()
-
-    def __post_init__(self):
-        parts.require_choices(self)
 
     def init(
         self, num_tasks: int, features: Array, obs: Any, seen: Any, action: Array, own: bool, key: Key

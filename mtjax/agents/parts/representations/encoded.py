@@ -83,7 +83,6 @@ class Encoded(Plain):
     slow: ClassVar[tuple[str, ...]] = ("latent",)  # those whose target copies move by encoder_tau
 
     def __post_init__(self):
-        super().__post_init__()
         (parts.require_layers if self.models else parts.require_widths)(self, "latent_widths")
         parts.require_not_negative(self, "shift")
         parts.require_rates(self, "encoder_tau")

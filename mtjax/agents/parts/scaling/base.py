@@ -16,7 +16,7 @@ class NoScaling:
 
     follows_resets: ClassVar[bool] = False  # whether its units are renewed by resets of networks alone
     discounted: ClassVar[bool] = False  # whether its units follow from a bound of discounted returns
-    fits_returns: ClassVar[bool] = False  # whether it keeps returns in a range
+    return_range: ClassVar[float | None] = None  # the largest |return| after scaling, if it keeps them in a range
     rescales: ClassVar[bool] = False  # whether it rescales the heads of critics, each task's own, as values move
     init, begin, remember, observe = Watcher.init, Watcher.begin, Watcher.remember, Watcher.observe
 

@@ -41,7 +41,6 @@ class ReturnScaling(NoScaling):
     """
 
     discounted: ClassVar[bool] = True
-    fits_returns: ClassVar[bool] = True
     return_range: float = 10.0
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
@@ -93,7 +92,6 @@ class ReturnNormalization(NoScaling):
     in the range.
     """
 
-    fits_returns: ClassVar[bool] = True
     return_range: float = 5.0
     """Largest |discounted sum of rewards so far| after scaling; with value=c51 or hl-gauss, the range of their bins."""
 
