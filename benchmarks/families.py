@@ -59,8 +59,8 @@ TRAINED = {  # family -> agent and steps
     "tabular-mdp": ("ppo", _M // 4),
     **{f"control-{name}": ("ppo", 4 * _M) for name in ("cartpole", "acrobot")},
     **{name: ("ppo", 2 * _M) for name in ("link", "racing", "sailing", "trading", "light-world", "coloured-maze")},
-    **{name: ("sketches", 10 * _M) for name in ("craft-sketched", "light-world-sketched", "errands")},
-    "craft": ("ppo", 10 * _M),
+    **{name: ("sketches", 10 * _M) for name in ("craft-sketched", "light-world-sketched")},
+    **{name: ("ppo", 10 * _M) for name in ("craft", "errands")},
     **{name: ("ppo", 2 * _M) for name in ("claw", "tabletop")},
     **{
         f"brax-{name}": ("ppo", 20 * _M)

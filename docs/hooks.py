@@ -299,19 +299,20 @@ def _score(row: dict[str, str]) -> str:
 
 def _family_figures(name: str) -> str:
     text = ""
-    if rows := _rows(RESULTS / "h200-returns" / "table.md", 0, name):
+    if rows := _rows(RESULTS / _THREE_SEEDS / "table.md", 0, name):
         text += f"\n### One H200, three seeds {_UNSEARCHED}\n\n{rows}"
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
+        text += f"\n![return over steps, three seeds]({name}-{_THREE_SEEDS}.png)\n"
     text += _methods(0, name)
     for runs, (title, place) in _ONE_SEED.items():
         for row in _runs_of(runs, name)[-1:]:
             text += f"\n### {title} {_UNSEARCHED}\n\n{row['agent']} had a return of {_score(row)} after "
             text += f"{float(row['seconds']):.0f} seconds ({int(row['steps']):,} steps). The "
-            text += f"[command](../results/returns.md#{place}).\n\n![return over steps]({name}-{runs}.png)\n"
+            text += f"[command](../results/returns.md#{place}).\n\n![return over steps]({_drawing(name, runs)}.png)\n"
     return f"\n## Figures\n{text}" if text else ""
 
 
-_ON_GPU, _ON_CPU = "h200-families", "cpu-films"
+_ON_GPU, _ON_CPU, _OF_FIFTY, _THREE_SEEDS = "h200-families", "cpu-films", "h100-metaworld/mt50-brc", "h200-returns"
 _FILMED = _ON_GPU, _ON_CPU, "h100-hard/films"  # runs whose policies the films show; the last one of a family
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
@@ -323,13 +324,41 @@ _ONE_SEED = {  # runs -> their title, and where their command stands
         "fifty-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
     ),
     "cpu-families": ("Two CPU cores, one seed", "twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed"),
+    "cpu-minutes": (
+        "Two CPU cores beside other programs, one seed, at most a minute",
+        "families-of-a-few-equations-a-minute-each-on-two-cpu-cores-one-seed",
+    ),
+    _OF_FIFTY: (
+        "One of the fifty tasks of mt50, one H100 beside another program, one seed",
+        "meta-worlds-mt50-half-a-million-steps-a-task-one-h100-one-seed",
+    ),
 }
 
 
 @lru_cache
 def _all_runs(runs: str) -> list[dict[str, str]]:
-    with (RESULTS / f"{runs}.csv").open() as file:
-        return list(csv.DictReader(file))
+    rows = _read(RESULTS / f"{runs}.csv")
+    return _of_each(rows) if runs == _OF_FIFTY else rows
+
+
+def _read(file: Path) -> list[dict[str, str]]:
+    with file.open() as lines:
+        return list(csv.DictReader(lines))
+
+
+def _of_each(rows: list[dict[str, str]]) -> list[dict[str, Any]]:
+    """Return the lines of one agent for all tasks of mt50 as lines of each task, with its own steps and return."""
+    names = list(envs.BENCHMARKS["mt50"][1])
+    line = lambda i, name, row: {
+        **{"family": name, "agent": "brc", "seconds": row["seconds"], "return": row[f"return_{i}"]},
+        "steps": str(int(row["steps"]) // len(names)),
+    }
+    return [line(i, name, row) for i, name in enumerate(names) for row in rows]
+
+
+def _drawing(name: str, runs: str) -> str:
+    """Return the name of the picture of a family's curve."""
+    return f"{name}-{runs.replace('/', '-')}"
 
 
 def _runs_of(runs: str, name: str) -> list[dict[str, str]]:
@@ -450,7 +479,7 @@ def _fields(cls: type) -> dict[str, str]:
 
 def _agent_figures(name: str) -> str:
     text = ""
-    if rows := _rows(RESULTS / "h200-returns" / "table.md", 1, name.upper()):
+    if rows := _rows(RESULTS / _THREE_SEEDS / "table.md", 1, name.upper()):
         text += f"\n### One H200, three seeds {_UNSEARCHED}\n\n{rows}"
         text += "\nThe [command](../results/returns.md#returns-within-minutes-of-training-on-one-h200-three-seeds).\n"
     text += _methods(1, name)
@@ -491,11 +520,13 @@ def _curves() -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     for runs in _ONE_SEED:
         for name in sorted({row["family"] for row in _all_runs(runs)} & set(envs.ENVS)):
             rows = _runs_of(runs, name)
-            found[f"families/{name}-{runs}"] = {rows[0]["agent"]: _curve(rows)}
+            found[f"families/{_drawing(name, runs)}"] = {rows[0]["agent"]: _curve(rows)}
+    for file in sorted((RESULTS / _THREE_SEEDS).glob("*.csv")):
+        agent = json.loads(file.with_suffix(".json").read_text())["agent"].partition("(")[0].lower()
+        found[f"families/{file.stem}-{_THREE_SEEDS}"] = {agent: _curve(_read(file))}
     for file in sorted((RESULTS / "h200-methods").glob("*/*.csv")):
         if file.stem in agents.AGENTS:
-            with file.open() as lines:
-                found.setdefault(f"agents/{file.stem}", {})[file.parent.name] = _curve(list(csv.DictReader(lines)))
+            found.setdefault(f"agents/{file.stem}", {})[file.parent.name] = _curve(_read(file))
     return found
 
 
