@@ -257,7 +257,7 @@ def test_a_process_with_other_code_keeps_nothing():
 
 def test_an_error_of_a_traced_program_comes_alone(monkeypatch):
     """And not as one that happened while the cache said why it keeps nothing."""
-    monkeypatch.setattr(trace_cache, "_folder", "")  # a test before this one may have given it one
+    monkeypatch.setattr(trace_cache, "_folder", [])  # a test before this one may have given it one
 
     class Broken:
         def trace(self, *arguments):
