@@ -498,10 +498,8 @@ def _summarise(seen: _Seen, losses: Any, learned: Array, count: int) -> Metrics:
     sums = jax.tree.map(over_steps, (seen.total, seen.metrics))
     counts, (total, metrics) = collectives.total((seen.counts, sums))
     finished, lost, bad, unrewarded = jnp.moveaxis(counts, -1, 0)
-    episodes, often = (
-        over_steps(finished),
-        over_steps(lost) > max(_MOST_LOST * count, 1),
-    )  # a short chunk may lose one too
+    episodes = over_steps(finished)
+    often = over_steps(lost) > max(_MOST_LOST * count, 1)  # a short chunk may lose a world too
     bad = (bad > 0) | (often & (lost > 0))
     # A bad step of one task spoils the losses of all that share its networks; then only that task is reported.
     blameless = ~jnp.any(bad, axis=3, keepdims=True)
