@@ -233,17 +233,20 @@ _TRIALS = {  # families whose tasks are hidden -> an agent that finds them out
 
 def _film_flags(name: str) -> list[str]:
     """Return the flags of the agent that a family's film shows, if it is known and not the default one."""
-    rows = [(runs, row["agent"]) for runs in _FILMED for row in _runs_of(runs, name)]
-    if not (PICTURES / f"{name}.webp").exists() or not rows:
-        return []
-    runs, agent = rows[-1]
-    known = agent in agents.AGENTS and not agents.AGENTS[agent].sees_pictures
-    flags = f"--env={name} --agent={agent}"
-    return (
-        [f"{flags}    # as in the film{', on a GPU' * (runs == _ON_GPU)}"]
-        if known and flags != family_flags(name)
-        else []
-    )
+    lines = []
+    for runs, row in _filmed(name):
+        agent = row["agent"]
+        known = agent in agents.AGENTS and not agents.AGENTS[agent].sees_pictures
+        flags = f"--env={name} --agent={agent}"
+        if known and flags != family_flags(name):
+            lines.append(f"{flags}    # as in the film{', on a GPU' * (runs == _ON_GPU)}")
+    return lines
+
+
+def _filmed(name: str) -> list[tuple[str, dict[str, str]]]:
+    """Return the runs, and the last line in them, of the policy that a family's film shows, if one is known."""
+    rows = [(runs, row) for runs in _FILMED for row in _runs_of(runs, name)]
+    return rows[-1:] if (PICTURES / f"{name}.webp").exists() else []
 
 
 def _described_bases(cls: type) -> list[type]:
@@ -284,10 +287,8 @@ def _picture(name: str) -> str:
     """Return a film or a still of a family's tasks, if there is one."""
     text = ""
     for file in PICTURES.glob(f"{name}.*"):
-        filmed = [row for runs in _FILMED for row in _runs_of(runs, name)]
-        last = filmed[-1:] if file.suffix == ".webp" else []
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
-        text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for r in last)
+        text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for _, r in _filmed(name))
     return text
 
 

@@ -91,7 +91,12 @@ def cut(text: str) -> list[str]:
 def anchors(text: str) -> dict[str, str]:
     """Return the titles of a text by their anchors."""
     titles = re.findall(r"(?m)^#{2,3} (.+)$", text)
-    return {slugify(re.sub(r"[`*]|\[([^]]*)\]\([^)]*\)", r"\1", title), "-"): title for title in titles}
+    return {slugify(_plain(title), "-"): title for title in titles}
+
+
+def _plain(title: str) -> str:
+    """Return a title without marks and addresses."""
+    return re.sub(r"[`*]|\[([^]]*)\]\([^)]*\)", r"\1", title)
 
 
 def _title(text: str) -> str:
@@ -112,7 +117,7 @@ def _with_contents(parts: list[str], names: list[str]) -> str:
 
 def _first(part: str) -> str:
     """Return a part's first title as plain text."""
-    return re.sub(r"[`*]|\[([^]]*)\]\([^)]*\)", r"\1", next(iter(anchors(part).values())))
+    return _plain(next(iter(anchors(part).values())))
 
 
 def _nest(nav: list[Any], page: str, parts: dict[str, str]) -> None:
