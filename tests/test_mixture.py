@@ -495,6 +495,19 @@ def test_tasks_of_a_family_that_does_not_train_are_seen_in_the_units_of_all_that
     assert not inputs.own  # so that no task, also of the other family, has moments of its own
 
 
+@pytest.mark.parametrize("families", [[SameAim()], [Aim(), SameAim()]], ids=["one normaliser", "one for each task"])
+def test_a_world_that_blows_up_does_not_spoil_what_all_others_look_like(families):
+    """One observation of 1e9 among 200,000 of a task would make all others 0. They stay two fifths of what they were."""
+    env = mixture(families)
+    agent, tasks = tiny(normalize_observations=True), env.counts["train"]
+    obs = np.float32(np.random.default_rng(0).normal(size=(tasks, 200_000, env.spec.obs_size)))
+    inputs = agent.view.count(init_inputs(env.spec, tasks), jnp.asarray(obs))
+    assert bool(inputs.own) == env.spec.mixed == (len(families) > 1)
+    obs[0, 0] = 1e9
+    seen = agent.view.see_all(agent.view.count(inputs, jnp.asarray(obs)), obs[:, 1:])
+    assert np.all(np.std(seen, axis=1) > 0.4)
+
+
 def widened(params: Params, like: Params, rows: np.ndarray, outputs: np.ndarray | None) -> Params:
     """Small networks inside of wide ones: weights at the wide one's input ``rows`` and ``outputs``, zero elsewhere."""
 

@@ -68,3 +68,11 @@ def test_what_lies_far_outside_is_clipped():
     np.testing.assert_allclose(normalize.apply(moments, x), [[9.9, 0, 1], [10, -10, 10], [-10, 10, -10]], rtol=1e-4)
     slopes = jax.jacobian(lambda x: normalize.apply(moments, x))(x[0])
     np.testing.assert_allclose(jnp.diag(slopes), [1, 1, 1000], rtol=1e-4)
+
+
+def test_what_lies_beyond_reason_is_counted_at_a_thousand_deviations():
+    """Before any observation there is no reason yet."""
+    x = jnp.float32([[5e9, 5.0, -1e9], [999.0, 4.5, 0.9]])
+    np.testing.assert_array_equal(normalize.bounded(normalize.init(3), x), x)
+    moments = fitted(np.float32([[-1.0, 4.0, 0.0], [1.0, 6.0, 0.0]]))
+    np.testing.assert_allclose(normalize.bounded(moments, x), [[1000, 5, -1], [999, 4.5, 0.9]])

@@ -9,6 +9,7 @@ from mtjax.types import Array
 _MIN_STD = 1e-3
 LARGEST = 10.0
 """Clip normalised observations to this size, so that rare ones do not drive networks out of range."""
+_FAR = 1e3
 
 
 class Moments(NamedTuple):
@@ -39,7 +40,21 @@ def merge(moments: Moments, others: Moments) -> Moments:
     return Moments(count, moments.mean + shift * share, deviation)
 
 
+def bounded(moments: Moments, x: Array) -> Array:
+    """Bring x (..., O) to within 1,000 standard deviations of the mean, as it is to be counted; all x at first.
+
+    A world that is about to blow up shows numbers of any size. Counted as they are, the numbers of one such step would
+    make all others look alike for the rest of a run.
+    """
+    far = jnp.where(moments.count > 0, _FAR * _std(moments), jnp.inf)
+    return jnp.clip(x, moments.mean - far, moments.mean + far)
+
+
 def apply(moments: Moments, x: Array) -> Array:
     """Scale x (..., O) to mean 0 and variance 1, and clip it to +-``LARGEST``."""
+    return jnp.clip((x - moments.mean) / _std(moments), -LARGEST, LARGEST)
+
+
+def _std(moments: Moments) -> Array:
     variance = jnp.where(moments.count > 0, moments.deviation / jnp.maximum(moments.count, 1), 1.0)
-    return jnp.clip((x - moments.mean) / jnp.maximum(jnp.sqrt(variance), _MIN_STD), -LARGEST, LARGEST)
+    return jnp.maximum(jnp.sqrt(variance), _MIN_STD)

@@ -40,12 +40,16 @@ class View:
         return self.conditioning.history or self.representation.history
 
     def count(self, inputs: Params, obs: Any) -> Params:
-        """Add the vectors (T, ..., O) in observations to the moments, with those on other devices."""
+        """Add the vectors (T, ..., O) in observations to the moments, with those on other devices.
+
+        Numbers that lie far off count as less (``normalize.bounded``).
+        """
         vectors = frames.state(join_arrays(inputs, obs))
         if not self.normalized or vectors is None:
             return inputs
         moments, mixed = inputs.parts["moments"], bool(inputs.own)
         vectors = vectors.reshape(len(vectors), -1, vectors.shape[-1])
+        vectors = (jax.vmap(normalize.bounded) if mixed else normalize.bounded)(moments, vectors)
         count = (vectors.shape[1] if mixed else vectors.shape[0] * vectors.shape[1]) * collectives.count()
         mean, variance = (x.reshape(moments.mean.shape) for x in mean_and_variance(vectors, 1 if mixed else (0, 1)))
         one = normalize.Moments(jnp.full_like(moments.count, count), mean, count * variance)
