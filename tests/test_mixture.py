@@ -497,7 +497,7 @@ def test_tasks_of_a_family_that_does_not_train_are_seen_in_the_units_of_all_that
 
 @pytest.mark.parametrize("families", [[SameAim()], [Aim(), SameAim()]], ids=["one normaliser", "one for each task"])
 def test_a_world_that_blows_up_does_not_spoil_what_all_others_look_like(families):
-    """One observation of 1e9 among 200,000 of a task would make all others 0. They stay two fifths of what they were."""
+    """One observation of 1e9 among 200,000 of a task would make all others 0. They keep two fifths of their size."""
     env = mixture(families)
     agent, tasks = tiny(normalize_observations=True), env.counts["train"]
     obs = np.float32(np.random.default_rng(0).normal(size=(tasks, 200_000, env.spec.obs_size)))
