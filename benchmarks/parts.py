@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 STARTED = "BENCHMARK_STARTED"  # the clock when the process of a part was started
 _OF_RUNNING = ("seconds", "within", "devices")  # flags of ``add_flags``
 _GRACE = 60.0  # seconds between asking a process to stop and ending it
+_POLL = 0.05  # seconds between two looks at what runs
 
 
 class Part(NamedTuple):
@@ -129,12 +130,14 @@ def run_parts(script: str, parts: Sequence[Part], out: Path, arguments: argparse
         if not result_of(out, part).exists():
             runner.waiting.put(part)
     threads = [threading.Thread(target=runner.play_all, args=(device,)) for device in arguments.devices]
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    before = signal.signal(signal.SIGTERM, runner.stop)
     try:
         for thread in threads:
             thread.start()
-        for thread in threads:
-            thread.join()
+        while any(thread.is_alive() for thread in threads):
+            time.sleep(_POLL)  # ``join`` would not wake for a signal that comes just before it blocks
+        if not runner.end:
+            sys.exit(128 + signal.SIGTERM)
     finally:
         runner.stop()
         signal.signal(signal.SIGTERM, before)
@@ -152,13 +155,10 @@ class _Runner:
     def __init__(self, script: str, out: Path, end: float, seconds: float):
         self.script, self.out, self.end, self.seconds = script, out, end, seconds
         self.waiting: queue.SimpleQueue[Part] = queue.SimpleQueue()
-        self.running: set[subprocess.Popen] = set()
 
-    def stop(self) -> None:
-        """Begin no further part, and ask those that run to stop."""
+    def stop(self, *_: Any) -> None:
+        """Begin no further part, and have those that run asked to stop. It may handle a signal."""
         self.end = 0.0
-        for process in list(self.running):
-            process.terminate()
 
     def play_all(self, device: str) -> None:
         """Run parts on one device until none is left or the time is over."""
@@ -177,30 +177,28 @@ class _Runner:
         with log.open("w") as file:
             words = [sys.executable, self.script, *part.words]
             process = subprocess.Popen(words, env=environment, stdout=file, stderr=file)
-            self.running.add(process)
-            # Only now, so that a part that begins while all are asked to stop is asked too.
-            _wait(process, min(self.end, time.monotonic() + self.seconds + _GRACE))
-            self.running.discard(process)
+            self.wait(process)
         done = result_of(self.out, part).exists()
         state = f"{'done' if done else 'no result'} after {time.time() - before:.0f} s"
         print(f"{part.name}: {state}" + ("" if done else f", see {log}{end_of(log)}"), flush=True)
+
+    def wait(self, process: subprocess.Popen) -> None:
+        """Wait for a process. Ask it to stop when the time is over, and end it if it does not."""
+        latest = time.monotonic() + self.seconds + _GRACE
+        while process.poll() is None and time.monotonic() < min(self.end, latest):
+            time.sleep(_POLL)
+        process.terminate()  # which does nothing to one that has ended
+        try:
+            process.wait(_GRACE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def end_of(log: Path) -> str:
     """Return the last line of a log, which says how the process ended; empty if there is none."""
     lines = log.read_text(errors="replace").split("\n")
     return next((f": {line}" for line in reversed(lines) if line.strip()), "")
-
-
-def _wait(process: subprocess.Popen, end: float) -> None:
-    """Wait for a process. Ask it to stop at ``end``, and end it if it does not."""
-    for limit, order in ((max(end - time.monotonic(), 0), signal.SIGTERM), (_GRACE, signal.SIGKILL)):
-        try:
-            process.wait(None if limit == float("inf") else limit)
-            return
-        except subprocess.TimeoutExpired:
-            process.send_signal(order)
-    process.wait()
 
 
 def end(table: str, out: Path, left: list[str]) -> None:

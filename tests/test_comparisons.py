@@ -1,11 +1,14 @@
 """Benchmarks that compare in parts: which parts run, and what tables make of their results."""
 
 import argparse
+import contextlib
 import importlib
 import json
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -25,6 +28,22 @@ if name == "fails":
 if name == "lasts":
     time.sleep(60)
 parts.write_result(pathlib.Path(out) / (name + ".json"), {{"name": name, "device": os.environ["CUDA_VISIBLE_DEVICES"]}})
+"""
+
+# A program of two parts that gets a signal during the first. The signal goes to a second thread, so it interrupts no
+# call of the main thread, as one that comes just before the main thread begins to wait.
+_DRIVER = """
+import sys, argparse, pathlib, signal, threading, time
+sys.path.insert(0, {folder!r})
+import parts
+out = pathlib.Path({out!r})
+def stop():
+    while not (out / "lasts.log").exists():
+        time.sleep(0.05)
+    signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+threading.Thread(target=stop, daemon=True).start()
+of_all = [parts.Part(name, [name, str(out)]) for name in ("lasts", "a")]
+parts.run_parts({script!r}, of_all, out, argparse.Namespace(within=50.0, devices=["0"]))
 """
 
 
@@ -65,21 +84,20 @@ def test_a_part_is_stopped_when_the_time_is_over(module, tmp_path):
     assert parts.run_parts(str(script), of_all, tmp_path, flags(within=0.5, devices=["0"])) == ["lasts", "a"]
 
 
-def test_parts_stop_with_the_program_that_started_them(module, tmp_path):
+def test_parts_stop_with_the_program_that_started_them(tmp_path):
     """On a signal, within a moment; nothing of them is left behind."""
     script, driver = tmp_path / "script.py", tmp_path / "driver.py"
     script.write_text(_SCRIPT.format(folder=str(FOLDER)))
-    driver.write_text(
-        f"import sys; sys.path.insert(0, {str(FOLDER)!r}); import argparse, pathlib, parts\n"
-        f"flags = argparse.Namespace(within=50.0, devices=['0'])\n"
-        f"of_all = [parts.Part(name, [name, {str(tmp_path)!r}]) for name in ('lasts', 'a')]\n"
-        f"parts.run_parts({str(script)!r}, of_all, pathlib.Path({str(tmp_path)!r}), flags)"
-    )
-    process = subprocess.Popen([sys.executable, str(driver)])
-    while not (tmp_path / "lasts.log").exists():
-        time.sleep(0.05)
-    process.terminate()
-    assert process.wait(20) == 128 + signal.SIGTERM and not (tmp_path / "a.log").exists()
+    driver.write_text(_DRIVER.format(folder=str(FOLDER), script=str(script), out=str(tmp_path)))
+    process = subprocess.Popen([sys.executable, str(driver)], start_new_session=True)
+    try:
+        assert process.wait(20) == 128 + signal.SIGTERM and not (tmp_path / "a.log").exists()
+        with pytest.raises(ProcessLookupError):
+            os.killpg(process.pid, 0)
+    finally:  # a program that goes on would fail the next test
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def test_a_part_that_begins_as_all_are_stopped_is_stopped(module, tmp_path, monkeypatch):
@@ -90,6 +108,23 @@ def test_a_part_that_begins_as_all_are_stopped_is_stopped(module, tmp_path, monk
     monkeypatch.setattr(parts.subprocess, "Popen", lambda *words, **given: (runner.stop(), begin(*words, **given))[1])
     runner.play(parts.Part("lasts", ["lasts", str(tmp_path)]), "0")
     assert not (tmp_path / "lasts.json").exists()
+
+
+def test_a_part_that_goes_on_when_asked_to_stop_is_ended(module, tmp_path, monkeypatch):
+    """After a time of grace, also where the parts have no time limit."""
+    parts, script, log = module("parts"), tmp_path / "script.py", tmp_path / "stays.log"
+    monkeypatch.setattr(parts, "_GRACE", 0.1)
+    script.write_text(
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('begun', flush=True); time.sleep(60)"
+    )
+    runner = parts._Runner(str(script), tmp_path, float("inf"), float("inf"))
+    playing = threading.Thread(target=runner.play, args=(parts.Part("stays", []), ""))
+    playing.start()
+    while playing.is_alive() and not (log.exists() and log.read_text()):
+        time.sleep(0.05)
+    runner.stop()
+    playing.join(20)
+    assert not playing.is_alive()
 
 
 def peer_result(side, seed, times, returns, cold, compiling=30.0):

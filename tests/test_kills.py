@@ -29,16 +29,20 @@ LONGEST = 8.0  # seconds until a process is killed, of which it takes about half
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
-    """Start a training process; its output is in a file."""
-    cache, out = tmp_path_factory.mktemp("cache"), tmp_path_factory.mktemp("out") / "out"
+    """Start a training process; its output is in a file. None outlives the tests of this module."""
+    cache, out, begun = tmp_path_factory.mktemp("cache"), tmp_path_factory.mktemp("out") / "out", []
     alike = environment(JAX_PLATFORMS="cpu", MTJAX_CACHE=str(cache))
 
     def start(*words, out=out):
         with out.open("w") as file:
             command = [sys.executable, "-m", "mtjax.train", *words]
-            return subprocess.Popen(command, env=alike, stdout=file, stderr=subprocess.STDOUT), out
+            begun.append(subprocess.Popen(command, env=alike, stdout=file, stderr=subprocess.STDOUT))
+        return begun[-1], out
 
-    return start
+    yield start
+    for process in begun:
+        process.kill()
+        process.wait()
 
 
 def finish(process, out):
@@ -207,17 +211,14 @@ def test_a_hosted_run_whose_environment_raises_ends_with_its_checkpoint(start, t
 def test_a_second_process_on_a_folder_is_refused(start, tmp_path):
     """In a line, at once; the first goes on undisturbed."""
     first, out = start(*RUN, f"--steps={100_000 * SAVE}", f"--runs={tmp_path}")
-    try:
-        until = time.monotonic() + 300
-        while not list(tmp_path.glob("*/checkpoints/*00")):
-            assert time.monotonic() < until and first.poll() is None, out.read_text()
-            time.sleep(0.2)
-        (folder,) = tmp_path.iterdir()
-        second, other = start(f"--resume={folder}", out=tmp_path / "second")
-        assert second.wait(120) == 2
-        assert other.read_text().count("\n") == 1 and f"in use: process {first.pid} on " in other.read_text()
-        assert first.poll() is None
-        first.send_signal(signal.SIGINT)
-        assert first.wait(120) == 130
-    finally:
-        first.kill()
+    until = time.monotonic() + 300
+    while not list(tmp_path.glob("*/checkpoints/*00")):
+        assert time.monotonic() < until and first.poll() is None, out.read_text()
+        time.sleep(0.2)
+    (folder,) = tmp_path.iterdir()
+    second, other = start(f"--resume={folder}", out=tmp_path / "second")
+    assert second.wait(120) == 2
+    assert other.read_text().count("\n") == 1 and f"in use: process {first.pid} on " in other.read_text()
+    assert first.poll() is None
+    first.send_signal(signal.SIGINT)
+    assert first.wait(120) == 130
