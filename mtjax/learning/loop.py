@@ -219,7 +219,7 @@ def run_chunk(env: Env, agent: Agent, settings: Settings, tasks: Task, state: Tr
         return state._replace(agent=learners, data=data, key=key), (seen, losses, learned)
 
     state, (seen, losses, learned) = jax.lax.scan(iterate, state, length=settings.chunk_steps // experience.steps)
-    seen = seen._replace(counts=seen.counts.at[0, 0, ..., 2].max(jnp.int32(~sound)))
+    seen = seen._replace(numbers=seen.numbers.at[0, 0, ..., 2].max(jnp.float32(~sound)))
     metrics = _summarise(seen, losses, learned, settings.num_envs * settings.chunk_steps)
     if state.heard is not None:
         returns = collectives.of_all_seeds(metrics["return"])
@@ -462,11 +462,14 @@ def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Ke
 
 
 class _Seen(NamedTuple):
-    """Holds the statistics of a step for metrics; leaves (S, T, ...). A GPU stores each by a kernel of its own."""
+    """Holds the statistics of a step for metrics, in one array, as a GPU stores each array by a kernel of its own.
 
-    counts: Array  # (S, T, 4) int32: episodes that ended and count, lost worlds, and 1 where numbers or rewards are bad
-    total: Array  # (S, T) of the returns of episodes that count
-    metrics: Metrics  # (S, T) of the environment, of these episodes' last steps
+    Its numbers are those of episodes that ended and count, of lost worlds, 1 where numbers are bad, 1 where rewards are,
+    and the sums of these episodes' returns, and of each metric of the environment at their last steps.
+    """
+
+    numbers: Array  # (S, T, 5 + M)
+    metrics: dict[str, None]  # the names of the M
 
 
 def _reduce_step(env_step: EnvStep, sound: Array, total: Array, counted: Array) -> _Seen:
@@ -481,8 +484,9 @@ def _reduce_step(env_step: EnvStep, sound: Array, total: Array, counted: Array) 
     finite = jnp.isfinite(transition.reward)
     bad, unrewarded = (jnp.any(~x, axis=2) for x in (sound & finite, finite))
     counts = (jnp.sum(finished, axis=2), jnp.sum(env_step.lost, axis=2), bad, unrewarded)
-    metrics = {name: over_envs(x) for name, x in env_step.metrics.items()}
-    return _Seen(jnp.stack([jnp.int32(x) for x in counts], axis=-1), over_envs(total), metrics)
+    names = sorted(env_step.metrics)
+    numbers = (*counts, over_envs(total), *(over_envs(env_step.metrics[name]) for name in names))
+    return _Seen(jnp.stack([jnp.float32(x) for x in numbers], axis=-1), dict.fromkeys(names))
 
 
 def _summarise(seen: _Seen, losses: Any, learned: Array, count: int) -> Metrics:
@@ -495,9 +499,10 @@ def _summarise(seen: _Seen, losses: Any, learned: Array, count: int) -> Metrics:
     """
     mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(learned), 1)
     over_steps = lambda x: jnp.sum(x, axis=(0, 1))
-    sums = jax.tree.map(over_steps, (seen.total, seen.metrics))
-    counts, (total, metrics) = collectives.total((seen.counts, sums))
-    finished, lost, bad, unrewarded = jnp.moveaxis(counts, -1, 0)
+    counts, sums = jnp.int32(seen.numbers[..., :4]), over_steps(seen.numbers[..., 4:])
+    (finished, lost, bad, unrewarded), (total, *metrics) = (
+        jnp.moveaxis(x, -1, 0) for x in collectives.total((counts, sums))
+    )
     episodes = over_steps(finished)
     often = over_steps(lost) > max(_MOST_LOST * count, 1)  # a short chunk may lose a world too
     bad = (bad > 0) | (often & (lost > 0))
@@ -509,7 +514,7 @@ def _summarise(seen: _Seen, losses: Any, learned: Array, count: int) -> Metrics:
     return {name: x.mean if isinstance(x, Weighted) else x for name, x in means.items()} | {
         "episodes": episodes,
         "return": total / episodes,
-        **{name: x / episodes for name, x in metrics.items()},
+        **{name: x / episodes for name, x in zip(seen.metrics, metrics, strict=True)},
         "lost": over_steps(lost),
         "bad_step": _first(bad),
         "bad_reward": _first(unrewarded > 0),
