@@ -25,6 +25,7 @@ from mtjax.envs.pixels import Drawable
 from mtjax.learning.evaluation import record
 from mtjax.report import render
 from mtjax.saved import pretrained
+from mtjax.saved.config_json import from_json
 from mtjax.saved.policy import Policy
 
 FOLDER = Path(__file__).parent / "pictures" / "families"
@@ -60,7 +61,8 @@ def save(name: str, frames: list[Image.Image]) -> None:
 def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
     """Return every family of a trained policy, and the frames of its film."""
     env: Any = policy.env
-    played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0))
+    sampled = from_json(Path(str(policy.directory)) / "config.json").plan.eval_sampled  # as the run was evaluated
+    played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0), sampled=sampled)
     for part, states in zip(env.parts, apart(played.kept), strict=True):
         family, places = part.family, part.places["train"]
         shown = few(len(places))

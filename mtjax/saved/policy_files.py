@@ -16,6 +16,7 @@ from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json, read_record, to_flags
 from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy, load
+from mtjax.types import Transition
 
 _SETTINGS = "config.json"
 
@@ -56,14 +57,19 @@ def _shorten_imports(record: dict[str, Any]) -> None:
 
 
 def read_by_acting(policy: Policy) -> list[int]:
-    """Return the numbers of those leaves of an agent's state on which its action depends."""
+    """Return the numbers of those leaves of an agent's state on which its actions depend, and what it remembers."""
     leaves, form = jax.tree.flatten(policy.state)
     task = jax.tree.map(lambda x: x[0], policy.env.tasks("train"))
     obs = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy.takes)
 
     def act(*leaves: Any) -> Any:
+        """Return the second action of an episode, as the first one is chosen without anything to remember."""
         state = jax.tree.unflatten(form, leaves)
-        return policy.agent.act(state, policy.agent.begin(state, task), obs, task, None).action
+        memory = policy.agent.begin(state, task)
+        action = policy.agent.act(state, memory, obs, task, None).action
+        step = Transition(obs, action, jnp.float32(0), jnp.float32(1), obs, jnp.bool_(False), jnp.bool_(False))
+        memory = policy.agent.remember(state, memory, step, task)
+        return policy.agent.act(state, memory, obs, task, None).action
 
     known = [x for x in leaves if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)]
     assert len(known) == len(leaves), "an agent's state holds a key of random numbers"
