@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
+import functools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,13 @@ _MAY_CHANGE = {  # the only flags beside --resume
     *("--resume", "--steps", "--import", "--distributed", "--profile", "--view"),
     *("--tensorboard", "--trackio", "--wandb"),
 }
-_SETTING = re.compile(r"(?<![\w.-])([a-z][\w-]*)=(?=\w)")
+_SETTING = re.compile(r"(?<![\w.'-])([a-z][\w-]*)=(?=\w)")  # in quotes stands what was given, which stays
+_ELSEWHERE = {  # names of settings in Stable-Baselines3, CleanRL and Brax
+    **dict.fromkeys(("total-timesteps", "num-timesteps", "timesteps"), "--steps"),
+    **dict.fromkeys(("algo", "algorithm", "policy"), "--agent"),
+    **{"env-id": "--env", "n-envs": "--num-envs", "n-eval-episodes": "--eval-episodes"},
+    **{"learning-rate": "--agent.actor-lr", "discounting": "--agent.gamma", "buffer-size": "--replay-size"},
+}
 
 
 def check_names(argv: Sequence[str]) -> None:
@@ -119,9 +126,18 @@ def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
         return InputError(f"{flag} needs the name of a parameter: {VARY}NAME=VALUES; --list says what varies")
     if flag.startswith("--vary."):
         return InputError(f"unknown flag {flag!r}; did you mean {flag.replace('--vary.', VARY)!r}?")
-    every = sorted([*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
-    end = re.sub(r"^--([\w-]+\.)*", "-", flag)
-    same_end = [other for other in every if other.replace(".", "-").endswith(end)]  # the name is right, or its end
-    near = difflib.get_close_matches(flag, same_end, 1, 0) or difflib.get_close_matches(flag, every, 1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    near = _nearest_flag(flag, [*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
+    hint = f"did you mean {near!r}? " if near else ""
     return InputError(f"unknown flag {flag!r}; {hint}--help lists the flags")
+
+
+def _nearest_flag(flag: str, known: Sequence[str]) -> str | None:
+    """Return the flag that was meant: by its name in other libraries, its letters, its end, or some of its letters."""
+    name = flag.rpartition(".")[2].lstrip("-")
+    if (meant := _ELSEWHERE.get(name)) in known:
+        return meant
+    words = {other.lstrip("-"): other for other in sorted(known)}
+    same_end = [word for word in words if f"-{word}".replace(".", "-").endswith(f"-{name}")]
+    close = functools.partial(difflib.get_close_matches, flag.lstrip("-"), n=1)
+    near = close(words, cutoff=0.85) or close(same_end, cutoff=0) or close(words, cutoff=0.65)
+    return words[near[0]] if near else None
