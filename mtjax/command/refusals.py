@@ -13,7 +13,7 @@ from mtjax.checks import require_run
 from mtjax.command.class_sources import all_flags, as_flag, whole_flags
 from mtjax.command.flags import VARY, flag_value, is_whole, switched_off, switched_on, with_port
 from mtjax.envs import ENVS, members, unknown_name
-from mtjax.names import PRESETS, InputError, nearest_error
+from mtjax.names import ELSEWHERE, PRESETS, InputError, nearest_error
 from mtjax.saved import pretrained
 
 _MAY_CHANGE = {  # the only flags beside --resume
@@ -21,12 +21,6 @@ _MAY_CHANGE = {  # the only flags beside --resume
     *("--tensorboard", "--trackio", "--wandb"),
 }
 _SETTING = re.compile(r"(?<![\w.'-])([a-z][\w-]*)=(?=\w)")  # in quotes stands what was given, which stays
-_ELSEWHERE = {  # names of settings in Stable-Baselines3, CleanRL and Brax
-    **dict.fromkeys(("total-timesteps", "num-timesteps", "timesteps"), "--steps"),
-    **dict.fromkeys(("algo", "algorithm", "policy"), "--agent"),
-    **{"env-id": "--env", "n-envs": "--num-envs", "n-eval-episodes": "--eval-episodes"},
-    **{"learning-rate": "--agent.actor-lr", "discounting": "--agent.gamma", "buffer-size": "--replay-size"},
-}
 
 
 def check_names(argv: Sequence[str]) -> None:
@@ -134,8 +128,9 @@ def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
 def _nearest_flag(flag: str, known: Sequence[str]) -> str | None:
     """Return the flag that was meant: by its name in other libraries, its letters, its end, or some of its letters."""
     name = flag.rpartition(".")[2].lstrip("-")
-    if (meant := _ELSEWHERE.get(name)) in known:
-        return meant
+    meant = as_flag(ELSEWHERE.get(name.replace("-", "_"), ""))
+    if meant:
+        return next((full for full in (f"--agent.{meant}", f"--{meant}") if full in known), None)
     words = {other.lstrip("-"): other for other in sorted(known)}
     same_end = [word for word in words if f"-{word}".replace(".", "-").endswith(f"-{name}")]
     close = functools.partial(difflib.get_close_matches, flag.lstrip("-"), n=1)
