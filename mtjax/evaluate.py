@@ -42,7 +42,7 @@ class Request:
     video_seconds: float = 10.0
     """Seconds that the film lasts. Slow worlds, such as a boat's, are shown faster than they are."""
     export: str = ""
-    """File to write the first seed's policy into: one that ends with .npz for ``mtjax/saved/standalone.py``, which
+    """File to write the first seed's policy into: one that ends with .npz for mtjax/saved/standalone.py, which
     reads it with NumPy or JAX alone, or with .onnx for other runtimes."""
     view: int = 0
     """Score nothing, and show a page on this machine: the run's curves as they come, and its newest policy in worlds

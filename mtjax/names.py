@@ -79,6 +79,14 @@ def replacing(path: Path) -> Iterator[Path]:
         new.unlink(missing_ok=True)
 
 
+ELSEWHERE = {  # names of settings in Stable-Baselines3, CleanRL and Brax, and ours
+    **dict.fromkeys(("total_timesteps", "num_timesteps", "timesteps"), "steps"),
+    **dict.fromkeys(("algo", "algorithm", "policy"), "agent"),
+    **{"env_id": "env", "n_envs": "num_envs", "n_eval_episodes": "eval_episodes"},
+    **{"learning_rate": "actor_lr", "discounting": "gamma", "buffer_size": "replay_size"},
+}
+
+
 def nearest_error(kind: str, given: str, allowed: Iterable[str], own: str = "") -> InputError:
     """Return an error for an unknown name, with the nearest match and the allowed names.
 
@@ -92,6 +100,7 @@ def nearest_error(kind: str, given: str, allowed: Iterable[str], own: str = "") 
     plain = {_plain(name): name for name in allowed}
     near = difflib.get_close_matches(_plain(given), plain, n=6, cutoff=0.5)
     near = [plain[name] for name in near or plain if near or name.endswith(f"-{_plain(given)}")]
+    near = [meant] if (meant := ELSEWHERE.get(given)) in allowed else near
     hint = f"did you mean {near[0]!r}? " if near else ""
     few = len(allowed) <= _MANY
     shown = ", ".join(allowed if few else near or allowed[:6]) + ("" if few else f", ... ({len(allowed)} in all)")

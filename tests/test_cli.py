@@ -433,7 +433,7 @@ def test_evaluate_has_help(words, capsys):
         mtjax.evaluate.main(words)
     assert not stop.value.code
     text = capsys.readouterr().out
-    assert all(flag in text for flag in ("--run", "--episodes", "--seed", "--video"))
+    assert all(flag in text for flag in ("--run", "--episodes", "--seed", "--video")) and "``" not in text
 
 
 def test_list_names_every_family_and_agent(capsys):
@@ -453,6 +453,7 @@ def test_list_names_every_family_and_agent(capsys):
     "words, said",
     [
         ("--env=finger-spn", "unknown environment 'finger-spn'; did you mean 'finger-spin'?"),
+        ("--env=CartPole-v1", "unknown environment 'CartPole-v1'; did you mean 'gymnasium:CartPole-v1'?"),
         ("--env=finger-spin,walker-walk", "'finger-spin,walker-walk' has commas; a mixture is NAME+NAME"),
         ("--runs=", "--runs needs a folder; that of the command is --runs=."),
         ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
@@ -460,7 +461,11 @@ def test_list_names_every_family_and_agent(capsys):
         ("--import", "--import needs a Python file\n"),
         ("--preset=gpus", "unknown preset 'gpus'; did you mean 'gpu'?"),
         ("--num-env=3", "unknown flag '--num-env'; did you mean '--num-envs'?"),
-        ("--nam=x", "unknown flag '--nam'; did you mean '--env'?"),
+        ("--nam=x", "unknown flag '--nam'; --help lists the flags"),
+        ("--device=gpu", "unknown flag '--device'; --help lists the flags"),
+        ("--step=3", "unknown flag '--step'; did you mean '--steps'?"),
+        ("--total-timesteps=3", "unknown flag '--total-timesteps'; did you mean '--steps'?"),
+        ("--agent.learning-rate=3", "unknown flag '--agent.learning-rate'; did you mean '--agent.actor-lr'?"),
         ("--lr=3", "unknown flag '--lr'; did you mean '--agent.actor-lr'?"),
         ("--agent.steps=3", "unknown flag '--agent.steps'; did you mean '--steps'?"),
         ("--no-stager", "unknown flag '--no-stager'; did you mean '--no-stagger'?"),
@@ -485,6 +490,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env", "--env needs a value"),
         ("--no-steps", "--steps is no switch"),
         ("finger-spin", "'finger-spin' belongs to no flag; write --NAME=VALUE"),
+        ("env=finger-spin", "'env=finger-spin' belongs to no flag; write --NAME=VALUE"),
         ("--profile=3", "--profile is a switch and takes no value: --profile is on, and --no-profile off"),
         ("--stagger=off", "--stagger is a switch and takes no value: --stagger is on, and --no-stagger off"),
         ("--env.vary=3", "--env.vary needs the name of a parameter: --env.vary.NAME=VALUES"),
@@ -493,7 +499,9 @@ def test_list_names_every_family_and_agent(capsys):
         ("--env=bandit --engine=c", "bandit has no flag --engine; "),
         ("--agent.hidden=8,8", "--agent.hidden takes values with spaces between them, such as --agent.hidden 8 8\n"),
         ("--env.vary.size 1 2 3", "'2' belongs to no flag"),
-        ("--agent.hidden wide", "wide"),
+        ("--agent.hidden wide", "--agent.hidden cannot take 'wide'; --help says what it takes"),
+        ("--agent.actor-lr=fast", "--agent.actor-lr must be a number, not 'fast'"),
+        ("--env.pixels --agent=sac", "--env.pixels needs a value"),
         ("--agent.hidden", "at least one layer"),
         ("--agent.conditioning=onehot", "onehot"),
         ("--agent.shared-temperature=yes", "--agent.shared-temperature is on, and --agent.no-shared-temperature off"),
@@ -611,7 +619,7 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
     """Tyro frames its errors in ASCII where standard output is not UTF-8."""
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
     said = complaint("train", "--agent.num-critics=many")
-    assert "--agent.num-critics: invalid literal for int() with base 10: 'many'" in said
+    assert "--agent.num-critics must be a whole number, not 'many'" in said
 
 
 @pytest.mark.parametrize(
@@ -627,7 +635,8 @@ def test_messages_do_not_depend_on_the_terminal(complaint, monkeypatch, encoding
         ("--run=x --episodes=0", "episodes must be at least 1"),
         ("--run=x --episodes=1000000", "and at most 100000, not 1000000"),
         ("--run=x --seed=2147483647", "seed must be at least 0 and at most 2000000000"),
-        ("--run=x --episodes=some", "some"),
+        ("--run=x --episodes=some", "--episodes must be a whole number, not 'some'"),
+        ("--run=x --split=train", "unknown flag '--split'; --help lists the flags"),
     ],
 )
 def test_evaluate_says_what_is_wrong(complaint, words, said):

@@ -307,6 +307,7 @@ def test_evaluate_prints_every_task_and_leaves_a_folder(copied_run, capsys):
     mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1"])
     lines = capsys.readouterr().out.splitlines()
     folder = copied_run / "evaluation-1"
+    assert lines[0].startswith("playing ")
     assert lines[-1] == f"written to {folder}" and "unseen" not in "".join(lines)
     assert {path.name for path in folder.iterdir()} == {"returns.csv", "return_by_size.png"}
     assert matplotlib.image.imread(folder / "return_by_size.png").std() > 0
@@ -381,7 +382,8 @@ def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, fi
     ]
     assert np.any(frames[0, :15, :240] > 200)  # the caption
     out = capsys.readouterr().out
-    assert re.search(r"filming 1 of 6: train, return \d+, size=1\n", out) and "filmed film: 6 tasks" in out
+    assert re.search(r"filming 1 of 6: train, return \d+, size=1\n", out)
+    assert re.search(r"writing the film of \d+ pictures\nfilmed film: 6 tasks", out)
 
 
 def test_a_trial_is_filmed_episode_by_episode(copied_run, filmed, tmp_path, capsys):

@@ -286,3 +286,13 @@ def test_values_may_be_negative_where_physics_has_such():
         _ = own(falling(), **damped).models
     positive = damped | {"parameters": {"damping": Parameter("N m s/rad", 1.0, set_damping, minimum=0.0)}}
     assert min(model.dof_damping[-1] for model in own(falling(), **positive).models) > 0
+
+
+def test_a_model_says_itself_what_it_lacks():
+    """MuJoCo did not refuse it, so nothing is said of MuJoCo."""
+
+    def lacking(domain):
+        raise InputError("the model is in a package that is not installed")
+
+    with pytest.raises(InputError, match=r"^the model is in a package that is not installed$"):
+        _ = own(lacking).models

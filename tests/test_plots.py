@@ -73,7 +73,9 @@ def test_seeds_of_equal_settings_are_joined_and_others_are_named_apart(runs, mak
 
 def test_learning_curves_are_means_with_bands(runs, tmp_path):
     """Of one family; several are drawn in a grid."""
-    with pytest.raises(InputError, match=r"the figure curves is of one family, and .*; draw the figure families"):
+    with pytest.raises(
+        InputError, match=r"the figure curves is of one family, and .* figure families \(figure='families'\)"
+    ):
         report.learning_curves(runs)
     folders = [tmp_path / "runs" / name for name in ("a1", "b")]
     axes = report.learning_curves(folders)

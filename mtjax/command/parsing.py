@@ -1,6 +1,7 @@
 """Parsing by tyro, with its framed messages in one line."""
 
 import contextlib
+import inspect
 import io
 import itertools
 import re
@@ -11,6 +12,18 @@ from mtjax.command.flags import switched_off
 from mtjax.names import InputError
 
 P = TypeVar("P")
+_PLAINER = {
+    r"^Error parsing ((plan|training|family|learner)[.\w]*: )?": "",
+    r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*": r"\1\3 is no switch that could be off; give it a value",
+    r"^Unrecognized options: (-[^-]\S*).*": r"'\1' has one dash, and flags have two: -\1",
+    r"^(--\S+): Could not find valid parse for arguments: \['[\d\s,]*'\]$": (
+        r"\1 takes values with spaces between them, such as \1 8 8"
+    ),
+    r"^(--\S+): Could not find valid parse for arguments: \[(.*)\]$": r"\1 cannot take \2; --help says what it takes",
+    r"^(--\S+): could not convert string to float: (.*)$": r"\1 must be a number, not \2",
+    r"^(--\S+): invalid literal for int\(\) with base 10: (.*)$": r"\1 must be a whole number, not \2",
+    r"^Missing value for argument '(--\S+)'.*": r"\1 needs a value",
+}
 
 
 def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) -> P:
@@ -24,19 +37,20 @@ def parse_with_tyro(cls: type[P], argv: Sequence[str], default: P, name: str) ->
     output = io.StringIO()
     try:
         with contextlib.redirect_stderr(output):
-            return tyro.cli(cls, args=list(argv), default=default, prog=name)
+            said = (inspect.getdoc(cls) or "").replace("``", "")
+            return tyro.cli(cls, args=list(argv), default=default, prog=name, description=said)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        message = re.sub(r"^Error parsing ((plan|training|family|learner)[.\w]*: )?", "", _unframed(output.getvalue()))
-        negated = r"^Unrecognized options: (--(\w+\.)*)no-(\S+).*"
-        message = re.sub(negated, r"\1\3 is no switch that could be off; give it a value", message)
-        single = r"^Unrecognized options: (-[^-]\S*).*"
-        message = re.sub(single, r"'\1' has one dash, and flags have two: -\1", message)
-        message = re.sub(r"^Unrecognized options: (?!-)(\S+?),?( .*)?$", lambda found: _unread(found[1], argv), message)
-        spaced = r"\1 takes values with spaces between them, such as \1 8 8"
-        message = re.sub(r"^(--\S+): Could not find valid parse for arguments: \['[\d\s,]*'\]$", spaced, message)
+        message = _plain(_unframed(output.getvalue()), argv)
         raise InputError(message or "the command line cannot be read; --help lists the flags") from None
+
+
+def _plain(message: str, argv: Sequence[str]) -> str:
+    """Return tyro's message in the words of the other errors."""
+    for pattern, words in _PLAINER.items():
+        message = re.sub(pattern, words, message)
+    return re.sub(r"^Unrecognized options: (?!-)(\S+?),?( .*)?$", lambda found: _unread(found[1], argv), message)
 
 
 def _unread(value: str, argv: Sequence[str]) -> str:

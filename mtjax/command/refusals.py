@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
+import functools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,14 +13,14 @@ from mtjax.checks import require_run
 from mtjax.command.class_sources import all_flags, as_flag, whole_flags
 from mtjax.command.flags import VARY, flag_value, is_whole, switched_off, switched_on, with_port
 from mtjax.envs import ENVS, members, unknown_name
-from mtjax.names import PRESETS, InputError, nearest_error
+from mtjax.names import ELSEWHERE, PRESETS, InputError, nearest_error
 from mtjax.saved import pretrained
 
 _MAY_CHANGE = {  # the only flags beside --resume
     *("--resume", "--steps", "--import", "--distributed", "--profile", "--view"),
     *("--tensorboard", "--trackio", "--wandb"),
 }
-_SETTING = re.compile(r"(?<![\w.-])([a-z][\w-]*)=(?=\w)")
+_SETTING = re.compile(r"(?<![\w.'-])([a-z][\w-]*)=(?=\w)")  # in quotes stands what was given, which stays
 
 
 def check_names(argv: Sequence[str]) -> None:
@@ -119,9 +120,19 @@ def unknown_flag(flag: str, known: Mapping[str, bool]) -> InputError:
         return InputError(f"{flag} needs the name of a parameter: {VARY}NAME=VALUES; --list says what varies")
     if flag.startswith("--vary."):
         return InputError(f"unknown flag {flag!r}; did you mean {flag.replace('--vary.', VARY)!r}?")
-    every = sorted([*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
-    end = re.sub(r"^--([\w-]+\.)*", "-", flag)
-    same_end = [other for other in every if other.replace(".", "-").endswith(end)]  # the name is right, or its end
-    near = difflib.get_close_matches(flag, same_end, 1, 0) or difflib.get_close_matches(flag, every, 1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    near = _nearest_flag(flag, [*known, *(switched_off(other) for other, is_switch in known.items() if is_switch)])
+    hint = f"did you mean {near!r}? " if near else ""
     return InputError(f"unknown flag {flag!r}; {hint}--help lists the flags")
+
+
+def _nearest_flag(flag: str, known: Sequence[str]) -> str | None:
+    """Return the flag that was meant: by its name in other libraries, its letters, its end, or some of its letters."""
+    name = flag.rpartition(".")[2].lstrip("-")
+    meant = as_flag(ELSEWHERE.get(name.replace("-", "_"), ""))
+    if meant:
+        return next((full for full in (f"--agent.{meant}", f"--{meant}") if full in known), None)
+    words = {other.lstrip("-"): other for other in sorted(known)}
+    same_end = [word for word in words if f"-{word}".replace(".", "-").endswith(f"-{name}")]
+    close = functools.partial(difflib.get_close_matches, flag.lstrip("-"), n=1)
+    near = close(words, cutoff=0.85) or close(same_end, cutoff=0) or close(words, cutoff=0.65)
+    return words[near[0]] if near else None

@@ -369,7 +369,9 @@ def _pairs(vary: Any) -> dict[str, Any]:
 
 
 def unknown_name(name: str) -> InputError:
-    """Return an error for a name of no environment."""
+    """Return an error for a name of no environment. Gymnasium's names, which end with a version, are told as such."""
+    if re.search(r"[A-Z].*-v\d+$", name) and ":" not in name:
+        return InputError(f"unknown environment {name!r}; did you mean 'gymnasium:{name}'? --list prints the others")
     suites = [f"{suite}:NAME" for suite in SUITES]
     own = describe_unnamed("mtjax.envs.family:Family", name, [home for home, _ in ENVS.data.values()])
     return nearest_error("environment", name, (*ENVS, *BENCHMARKS, *suites), own)

@@ -54,6 +54,8 @@ def compile_model(domain: Any, values: Mapping[str, float]) -> mujoco.MjModel:
     given = ", ".join(f"{name}={value:g}" for name, value in values.items()) or "its own values"
     try:
         model = domain.compile_spec(values).compile()
+    except InputError:  # the model itself says what it lacks, such as a package
+        raise
     except ValueError as error:
         reason = str(error).strip().splitlines()[0][:150] if str(error).strip() else "no reason given"
         raise InputError(f"MuJoCo cannot build {type(domain).__name__} with {given}: {reason}") from None

@@ -122,6 +122,7 @@ def write(
         print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
         tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, acting))
     captions = [_caption(env, one, played, named) for one in chosen]
+    print(f"writing the film of {count} pictures", flush=True)
     path = render.write_video(stem, grid(captioned(tiles, captions), columns), _FPS)
     print(f"filmed {path.name}: {len(chosen) // max(columns, 1)} tasks{f' by {columns} episodes' * bool(columns)}")
     if acting is not None:

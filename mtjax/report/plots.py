@@ -33,7 +33,7 @@ _LETTERS, _KEY = 13, 6  # in an inch of a legend, and as many as the line before
 def learning_curves(runs: Any = "runs/*", split: str = "train", ax: "Axes | None" = None) -> "Axes":
     """Draw the mean return of a split over environment steps, a line for each agent, of runs of one family."""
     found = _of_split(runs, split)
-    _require_one_family(found, "curves", "; draw the figure families")
+    _require_one_family(found, "curves", "; draw the figure families (--figure=families)")
     axes = ax if ax is not None else figures.new_axes()
     for index, one in enumerate(found):
         figures.draw_curve(axes, one.steps, one.returns[split], _label(one), index)

@@ -180,6 +180,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
     tasks = policy.env.tasks("all") if tasks is None else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
+    print(f"playing {request.episodes * len(tasks.id)} episodes", flush=True)
     scores = score(policy, Episodes(request.episodes, policy.trial, request.sampled), request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
     if told := describe_unseen(policy.agent):

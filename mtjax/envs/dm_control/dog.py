@@ -235,7 +235,7 @@ class DogWalk(Dog):
 
 @dataclasses.dataclass(frozen=True)
 class DogTrot(Dog):
-    """Trot: DogWalk at 3 to 6 m/s."""
+    """Trot: move forwards at 3 to 6 m/s, upright."""
 
     parameters: ClassVar = MappingProxyType({**Dog.parameters, "speed": positive("m/s", 3.0)})
     floor: ClassVar[float] = 3 * _SECONDS
@@ -243,7 +243,7 @@ class DogTrot(Dog):
 
 @dataclasses.dataclass(frozen=True)
 class DogRun(Dog):
-    """Run: as the walk, but at 9 to 18 m/s."""
+    """Run: move forwards at 9 to 18 m/s, upright."""
 
     parameters: ClassVar = MappingProxyType({**Dog.parameters, "speed": positive("m/s", 9.0)})
     floor: ClassVar[float] = 9 * _SECONDS
