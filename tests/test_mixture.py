@@ -682,7 +682,7 @@ def test_a_run_keeps_every_tasks_returns(run):
 def test_a_run_is_scored_family_by_family(run, capsys):
     mtjax.evaluate.main([f"--run={run}", "--episodes=1", "--diagnostics"])
     said = capsys.readouterr().out
-    assert said.index("\naim") > said.index("aim\nsplit") >= 0 and "all families" in said
+    assert said.rindex("\naim") > said.index("\naim\nsplit") and "all families" in said
     assert "wide-aim" in said and "aim goal=-1" in said
     (folder,) = run.glob("evaluation-*")
     assert {"returns.csv", "return_by_task.png", "diagnostics.json"} <= {file.name for file in folder.iterdir()}
