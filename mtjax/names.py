@@ -79,11 +79,14 @@ def replacing(path: Path) -> Iterator[Path]:
         new.unlink(missing_ok=True)
 
 
-ELSEWHERE = {  # names of settings in Stable-Baselines3, CleanRL and Brax, and ours
+ELSEWHERE = {  # names of settings and agents in Stable-Baselines3, CleanRL and Brax, and ours or our nearest
     **dict.fromkeys(("total_timesteps", "num_timesteps", "timesteps"), "steps"),
     **dict.fromkeys(("algo", "algorithm", "policy"), "agent"),
     **{"env_id": "env", "n_envs": "num_envs", "n_eval_episodes": "eval_episodes"},
     **{"learning_rate": "actor_lr", "discounting": "gamma", "buffer_size": "replay_size"},
+    **dict.fromkeys(("td3", "ddpg"), "sac"),
+    **dict.fromkeys(("a2c", "trpo"), "ppo"),
+    **{"dqn": "pqn"},
 }
 
 

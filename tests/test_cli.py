@@ -458,6 +458,7 @@ def test_list_names_every_family_and_agent(capsys):
         ("--runs=", "--runs needs a folder; that of the command is --runs=."),
         ("--agent carr", "unknown agent 'carr'; did you mean 'care'?"),
         ("--agent=SAC", "unknown agent 'SAC'; did you mean 'sac'?"),
+        ("--agent=ddpg", "unknown agent 'ddpg'; did you mean 'sac'?"),
         ("--import", "--import needs a Python file\n"),
         ("--preset=gpus", "unknown preset 'gpus'; did you mean 'gpu'?"),
         ("--num-env=3", "unknown flag '--num-env'; did you mean '--num-envs'?"),
