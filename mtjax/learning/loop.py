@@ -464,8 +464,8 @@ def _reset_networks(env, agent, tasks, learners: Any, iteration: Array, keys: Ke
 class _Seen(NamedTuple):
     """Holds the statistics of a step for metrics, in one array, as a GPU stores each array by a kernel of its own.
 
-    Its numbers are those of episodes that ended and count, of lost worlds, 1 where numbers are bad, 1 where rewards are,
-    and the sums of these episodes' returns, and of each metric of the environment at their last steps.
+    It holds the number of episodes that ended and count, the number of lost worlds, 1 where numbers are bad, 1 where
+    rewards are, and the sums of these episodes' returns, and of each metric of the environment at their last steps.
     """
 
     numbers: Array  # (S, T, 5 + M)
