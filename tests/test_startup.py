@@ -165,11 +165,16 @@ def test_flags_of_all_families_and_agents_are_known_without_jax(ours):
 
 
 @pytest.mark.parametrize(
-    "given, meant", [("--nam=x", "--env"), ("--no-stager", "--no-stagger"), ("--tau=1", "--agent.tau")]
+    "given, told",
+    [
+        ("--nam=x", "unknown flag '--nam'; --help lists"),
+        ("--no-stager", "did you mean '--no-stagger'"),
+        ("--tau=1", "did you mean '--agent.tau'"),
+    ],
 )
-def test_an_unknown_flag_is_answered_with_a_real_one(ours, given, meant):
-    """Other names in the classes' source are no flags."""
-    with pytest.raises(InputError, match=f"did you mean '{meant}'"):
+def test_an_unknown_flag_is_answered_with_a_real_one(ours, given, told):
+    """If one is near. Other names in the classes' source, such as ``name``, are no flags."""
+    with pytest.raises(InputError, match=told):
         refusals.check_flags([given])
 
 
