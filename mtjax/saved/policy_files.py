@@ -16,7 +16,6 @@ from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json, read_record, to_flags
 from mtjax.saved.operations import steps_of
 from mtjax.saved.policy import Policy, load
-from mtjax.types import Transition
 
 _SETTINGS = "config.json"
 
@@ -64,12 +63,10 @@ def read_by_acting(policy: Policy) -> list[int]:
 
     def act(*leaves: Any) -> Any:
         """Return the second action of an episode, as the first one is chosen without anything to remember."""
-        state = jax.tree.unflatten(form, leaves)
-        memory = policy.agent.begin(state, task)
-        action = policy.agent.act(state, memory, obs, task, None).action
-        step = Transition(obs, action, jnp.float32(0), jnp.float32(1), obs, jnp.bool_(False), jnp.bool_(False))
-        memory = policy.agent.remember(state, memory, step, task)
-        return policy.agent.act(state, memory, obs, task, None).action
+        played = dataclasses.replace(policy, state=jax.tree.unflatten(form, leaves))
+        act = lambda memory: played.agent.act(played.state, memory, obs, task, None).action
+        memory = played.begin(task)
+        return act(played.remember(memory, task, obs, act(memory), 0.0, obs))
 
     known = [x for x in leaves if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)]
     assert len(known) == len(leaves), "an agent's state holds a key of random numbers"
