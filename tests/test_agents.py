@@ -61,8 +61,8 @@ def some(cases, every, nightly=False):
 # twenty-three have no divisor in common with the number of ways, so that every way is in the default. Of the many
 # conditionings .ci/run takes four of seven.
 TRACED = [
-    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 13, nightly=True),
-    *some([(name, {"conditioning": conditioning, "gradients": "pcgrad"}) for conditioning, name in SURGERY], 23),
+    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 17, nightly=True),
+    *some([(name, {"conditioning": conditioning, "gradients": "pcgrad"}) for conditioning, name in SURGERY], 31),
     *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 7),
     *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 5),
     *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 3),

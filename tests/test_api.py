@@ -184,9 +184,9 @@ _REDO = {"encoder": "identity", "unit_head": False, "plasticity": "redo"}
 )
 def test_a_command_and_keywords_make_one_configuration(agent, given):
     """Settings are checked together with those of which the agent's own default is refused."""
-    made = keywords.configured("cheetah-run-vary-torso-length", agent, given, plan={"steps": 3000})
+    made = keywords.configured("cartpole-swingup-vary-pole-mass", agent, given, plan={"steps": 3000})
     words = [word for name, value in given.items() for word in _as_words(made, name, value)]
-    said = run_config.parse(["--env=cheetah-run-vary-torso-length", f"--agent={agent}", "--steps=3000", *words])
+    said = run_config.parse(["--env=cartpole-swingup-vary-pole-mass", f"--agent={agent}", "--steps=3000", *words])
     assert said == made
 
 

@@ -509,7 +509,7 @@ def test_values_are_learned_through_the_slow_encoder():
 @pytest.mark.parametrize(
     "settings",
     one_in(
-        2,
+        4,
         [
             *({"conditioning": conditioning} for conditioning in ("one-hot", "embedding", "parameters", "inferred")),
             {"conditioning": "embedding", "unit_embedding": True, "unit_theta": True, "unseen_theta": "zero"},
@@ -547,7 +547,7 @@ def test_the_agents_are_sac_with_that_part():
 
 @pytest.mark.parametrize("representation", slow_but(["deepmdp", "hip-bmdp"], "deepmdp"))
 @pytest.mark.parametrize(
-    "name", one_in(2, ["sac", "care", "soft-modularization", "multi-head", "disjoint", "brc", "cagrad"])
+    "name", one_in(4, ["sac", "care", "soft-modularization", "multi-head", "disjoint", "brc", "cagrad"])
 )
 def test_other_agents_stand_on_it(name, representation):
     """Traced, not run: actor and critics on latent states, one encoder and one of each model beside them."""
