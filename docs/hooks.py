@@ -33,6 +33,7 @@ from mtjax.envs.metaworld.scene import INSTALL
 from mtjax.envs.pixels import Pictured
 from mtjax.names import InputError, first_sentence
 from mtjax.report import figures
+from mtjax.saved import pretrained
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -289,7 +290,13 @@ def _picture(name: str) -> str:
     for file in PICTURES.glob(f"{name}.*"):
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
         text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for _, r in _filmed(name))
-    return text
+    return text + "".join(f"As [`{policy}`](../results/policies.md) plays.\n\n" for policy in _players(name))
+
+
+def _players(name: str) -> list[str]:
+    """Return the policies of the package that play a benchmark with this family in it."""
+    own = {policy: policy.split("/")[0] for policy in pretrained.names()}
+    return [policy for policy, of in own.items() if of in envs.BENCHMARKS and name in envs.BENCHMARKS[of][1]]
 
 
 def _score(row: dict[str, str]) -> str:

@@ -3,9 +3,9 @@
     python docs/make_films.py [NAME | RUN ...]
 
 A run's folder becomes the films of its families, and so does a family of which the package has a trained policy
-(``benchmarks/families.py`` trains policies for films). Other families that MuJoCo steps become stills, unless they have
-a film. Both are of the first, the middle and the last training task. They go to docs/pictures/families. Meta-World's
-scenes are not drawn, as they are another package's.
+(``benchmarks/families.py`` trains policies for films). So do those of a benchmark for which it has one: ``mt10``. Other
+families that MuJoCo steps become stills, unless they have a film. Both are of the first, the middle and the last
+training task. They go to docs/pictures/families. Meta-World's need its package.
 """
 
 import sys
@@ -32,6 +32,7 @@ FOLDER = Path(__file__).parent / "pictures" / "families"
 SIZE = (160, 120)
 SKIPPED = 150  # steps of a long episode before a film of it, in which the body gets going
 FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the next, milliseconds that each is shown
+ARM_STRIDE = 4  # of Meta-World's arm, whose films show how it starts and succeeds
 QUALITY = 70  # a third of the bytes that a gif has
 
 
@@ -41,7 +42,7 @@ def draw(name: str) -> None:
     if Path(name).is_dir() or trained:
         for family, frames in play(mtjax.load(trained[0] if trained else name)):
             save(name_of(family), frames)
-    elif name.startswith("metaworld-") or (FOLDER / f"{name}.webp").exists():
+    elif (FOLDER / f"{name}.webp").exists():
         return
     elif isinstance(env := mtjax.make(name), Drawable) and env.films:
         save(name, [start(env)])
@@ -68,16 +69,21 @@ def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
         shown = few(len(places))
         rows = [env.own_row(int(played.rows[place])) for place in places[shown]]
         states = each(states, shown)
-        film = frames_from(family, rows, states, min(SKIPPED, family.episode_length // 10))
-        moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
-        if np.mean(moves) < 0.5:  # a goal that is reached already
-            film = frames_from(family, rows, states, 0)
-        yield family, [Image.fromarray(frame) for frame in film]
+        yield family, [Image.fromarray(frame) for frame in best_part(family, rows, states)]
 
 
-def frames_from(family: Any, rows: Sequence[int], states: Any, first: int) -> np.ndarray:
+def best_part(family: Any, rows: Sequence[int], states: Any) -> np.ndarray:
+    """Return the frames (FRAMES, height, width, 3) in which a policy is at work, of states (T, H, ...)."""
+    if name_of(family).startswith("metaworld-"):
+        return frames_from(family, rows, states, 0, ARM_STRIDE)
+    film = frames_from(family, rows, states, min(SKIPPED, family.episode_length // 10))
+    moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
+    return film if np.mean(moves) >= 0.5 else frames_from(family, rows, states, 0)  # a goal that is reached already
+
+
+def frames_from(family: Any, rows: Sequence[int], states: Any, first: int, stride: int = STRIDE) -> np.ndarray:
     """Return the frames (FRAMES, height, width, 3) of tasks beside each other, from a step of states (T, H, ...) on."""
-    seen = jax.tree.map(lambda x: x[:, first : first + FRAMES * STRIDE : STRIDE], states)
+    seen = jax.tree.map(lambda x: x[:, first : first + FRAMES * stride : stride], states)
     return np.concatenate([render.film(family, row, each(seen, i), *SIZE) for i, row in enumerate(rows)], axis=2)
 
 
@@ -85,8 +91,8 @@ def start(env: Any) -> Image.Image:
     """Return a picture of tasks at their start."""
     tasks = jax.tree.map(lambda x: x[few(len(x))], env.tasks("train"))
     states = jax.jit(jax.vmap(env.reset))(tasks, jax.random.split(jax.random.key(0), len(tasks.row))).state
-    stills = [render.film(env, int(row), each(states, slice(i, i + 1)), *SIZE)[0] for i, row in enumerate(tasks.row)]
-    return Image.fromarray(np.concatenate(stills, axis=1))
+    states = jax.tree.map(lambda x: x[:, None], states)  # episodes of one step
+    return Image.fromarray(frames_from(env, tasks.row.tolist(), states, 0)[0])
 
 
 def few(count: int) -> np.ndarray:
