@@ -290,13 +290,17 @@ def _picture(name: str) -> str:
     for file in PICTURES.glob(f"{name}.*"):
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
         text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for _, r in _filmed(name))
-    return text + "".join(f"As [`{policy}`](../results/policies.md) plays.\n\n" for policy in _players(name))
+        if file.suffix == ".webp" and not _filmed(name):
+            text += "".join(f"As [`{policy}`](../results/policies.md) plays.\n\n" for policy in _players(name)[:1])
+        if file.suffix == ".webp" and name in _TRIALS:
+            text += "The episodes of one trial, side by side.\n\n"
+    return text
 
 
 def _players(name: str) -> list[str]:
-    """Return the policies of the package that play a benchmark with this family in it."""
-    own = {policy: policy.split("/")[0] for policy in pretrained.names()}
-    return [policy for policy, of in own.items() if of in envs.BENCHMARKS and name in envs.BENCHMARKS[of][1]]
+    """Return the policies of the package that play a family, alone or in a benchmark."""
+    played = {policy: policy.split("/")[0] for policy in pretrained.names()}
+    return [x for x, of in played.items() if of == name or name in envs.BENCHMARKS.get(of, ("", ()))[1]]
 
 
 def _score(row: dict[str, str]) -> str:

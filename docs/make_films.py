@@ -31,7 +31,7 @@ from mtjax.saved.policy import Policy
 FOLDER = Path(__file__).parent / "pictures" / "families"
 SIZE = (160, 120)
 SKIPPED = 150  # steps of a long episode before a film of it, in which the body gets going
-FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the next, milliseconds that each is shown
+FRAMES, STRIDE, DURATION = 30, 2, 40  # of a film: frames, steps from one to the next, milliseconds of each, at least
 ARM_STRIDE = 4  # of Meta-World's arm, whose films show how it starts and succeeds
 QUALITY = 70  # a third of the bytes that a gif has
 
@@ -41,34 +41,37 @@ def draw(name: str) -> None:
     trained = [known for known in pretrained.names() if known.startswith(f"{name}/")]
     if Path(name).is_dir() or trained:
         for family, frames in play(mtjax.load(trained[0] if trained else name)):
-            save(name_of(family), frames)
+            save(name_of(family), frames, max(DURATION, round(1000 * family.seconds_per_step / family.film_speed)))
     elif (FOLDER / f"{name}.webp").exists():
         return
     elif isinstance(env := mtjax.make(name), Drawable) and env.films:
-        save(name, [start(env)])
+        save(name, [start(env)], DURATION)
 
 
-def save(name: str, frames: list[Image.Image]) -> None:
-    """Write a film, or a still if it is one frame, in place of what was there."""
+def save(name: str, frames: list[Image.Image], duration: int) -> None:
+    """Write a film, each of whose frames is shown for so many milliseconds, or a still if it is one frame."""
     for old in FOLDER.glob(f"{name}.*"):
         old.unlink()
     if len(frames) == 1:
-        frames[0].quantize(64).save(FOLDER / f"{name}.png", optimize=True)
+        frames[0].quantize(256).save(FOLDER / f"{name}.png", optimize=True)
         return
-    rest = {"append_images": frames[1:], "save_all": True, "duration": DURATION, "loop": 0}
+    rest = {"append_images": frames[1:], "save_all": True, "duration": duration, "loop": 0}
     frames[0].save(FOLDER / f"{name}.webp", quality=QUALITY, method=6, **rest)
 
 
 def play(policy: Policy) -> Iterator[tuple[Any, list[Image.Image]]]:
-    """Return every family of a trained policy, and the frames of its film."""
+    """Return every family of a trained policy, and the frames of its film: of tasks, or of a trial's episodes."""
     env: Any = policy.env
     sampled = from_json(Path(str(policy.directory)) / "config.json").plan.eval_sampled  # as the run was evaluated
-    played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0), sampled=sampled)
+    played = record(env, policy.agent, policy.state, env.tasks("train"), jnp.int32(0), policy.trial, sampled=sampled)
     for part, states in zip(env.parts, apart(played.kept), strict=True):
         family, places = part.family, part.places["train"]
         shown = few(len(places))
         rows = [env.own_row(int(played.rows[place])) for place in places[shown]]
         states = each(states, shown)
+        if policy.trial > 1:
+            rows = rows[:1] * policy.trial
+            states = jax.tree.map(lambda x: x[0].reshape(policy.trial, -1, *x.shape[2:]), states)
         yield family, [Image.fromarray(frame) for frame in best_part(family, rows, states)]
 
 
@@ -76,6 +79,8 @@ def best_part(family: Any, rows: Sequence[int], states: Any) -> np.ndarray:
     """Return the frames (FRAMES, height, width, 3) in which a policy is at work, of states (T, H, ...)."""
     if name_of(family).startswith("metaworld-"):
         return frames_from(family, rows, states, 0, ARM_STRIDE)
+    if family.episode_length <= FRAMES:
+        return frames_from(family, rows, states, 0, 1)
     film = frames_from(family, rows, states, min(SKIPPED, family.episode_length // 10))
     moves = np.any(film[1:] != film[:-1], axis=(1, 2, 3))
     return film if np.mean(moves) >= 0.5 else frames_from(family, rows, states, 0)  # a goal that is reached already

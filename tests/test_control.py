@@ -5,6 +5,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from probes import tiny
@@ -293,6 +294,36 @@ def test_mtenv_numbers_of_an_acrobot():
     np.testing.assert_allclose(acrobot_numbers(values), [1, -1, 0.5, -0.5, 0, 0, -0.25])
     with pytest.raises(ValueError):
         acrobot_parameters(np.zeros(5))
+
+
+def seen(env, row, state):
+    """The scene of a task with its bodies where a picture of the state shows them."""
+    model = env.scene_model(row)
+    data = mujoco.MjData(model)
+    data.qpos[:] = env.visible(None, state).joints
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_a_picture_shows_the_cart_and_a_pole_of_the_tasks_length():
+    """A pole leans towards positive x where its angle is positive. Its middle is at half its length."""
+    env = mtjax.make("control-cartpole", vary={"pole-length": "0.3,0.8"}, combine="grid", split="none")
+    for row, length in enumerate((0.3, 0.8)):
+        data = seen(env, row, CartPoleState(*map(jnp.float32, (-1.2, 0, 0.2, 0))))
+        np.testing.assert_allclose(data.geom_xpos[1], [-1.2, 0, 0], atol=1e-6)
+        middle = [-1.2 + length * math.sin(0.2), -0.2, length * math.cos(0.2)]
+        np.testing.assert_allclose(data.geom_xpos[2], middle, atol=1e-6)
+
+
+def test_a_picture_shows_both_links_of_an_acrobot():
+    """Its end is where the episode's rule has it: above the bar exactly if the episode ends."""
+    first, second = 2.5, 0.4
+    data = seen(ACROBOT, 0, AcrobotState(jnp.array([first, second]), jnp.zeros(2)))
+    elbow = np.array([math.sin(first), 0, -math.cos(first)])
+    np.testing.assert_allclose(data.geom_xpos[1], elbow / 2, atol=1e-6)
+    half = np.array([math.sin(first + second), 0, -math.cos(first + second)]) / 2
+    np.testing.assert_allclose(data.geom_xpos[2], elbow + half, atol=1e-6)
+    assert data.geom_xpos[0, 2] == 1
 
 
 @pytest.mark.parametrize("env", [CARTPOLE, ACROBOT], ids=["cartpole", "acrobot"])

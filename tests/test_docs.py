@@ -238,6 +238,10 @@ def test_a_film_names_the_agent_that_plays(hooks):
     shown = "python -m mtjax.train --env=walker-run --agent=brc    # as in the film, on a GPU\n"
     assert shown in hooks.family_page("walker-run")
     assert hooks._film_flags("dog-stand") == hooks._film_flags("metaworld-push") == []
+    plays = "As [`{}`](../results/policies.md) plays."
+    assert plays.format("mt10/brc") in hooks._picture("metaworld-push")
+    assert plays.format("grid-navi/rl2") in hooks._picture("grid-navi")
+    assert not any("plays." in hooks._picture(name) for name in ("metaworld-assembly", "walker-run"))
 
 
 def test_a_first_sentence_is_whole():

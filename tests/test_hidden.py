@@ -10,6 +10,7 @@ from probes import QUICK, Stub
 from mtjax import make
 from mtjax.envs.hidden import GridNavi, HiddenBandit, even_points
 from mtjax.learning.evaluation import Episodes, evaluate
+from mtjax.report import render
 from mtjax.types import Acted, InputError
 
 
@@ -201,3 +202,27 @@ def test_worlds_that_make_no_sense_are_refused(cls, given, said):
     """With what is allowed."""
     with pytest.raises(InputError, match=said):
         cls(**given)
+
+
+# What is seen.
+
+
+def test_pictures_show_a_walker_and_hide_the_goal_that_films_show():
+    """The picture that an agent observes is the same for all goals, and changes with the cell."""
+    env = GridNavi(size=3, pixels=32)
+    at = lambda x, y, goal: np.asarray(env.look_at(task_with(env, jnp.array(goal)), jnp.array([x, y]))["pixels"])
+    np.testing.assert_array_equal(at(0, 0, [2, 2]), at(0, 0, [0, 2]))
+    assert np.any(at(0, 0, [2, 2]) != at(1, 0, [2, 2]))
+    marks = env.visible(task_with(env, jnp.array([0, 2])), jnp.array([1, 0])).marks
+    assert [float(x) for x in marks["goal"].position[:2]] == [0, 2]
+    assert [float(x) for x in marks["walker"].position[:2]] == [1, 0]
+
+
+def test_a_film_shows_the_task_that_a_trial_has_drawn():
+    """Its row lies behind that of the training task."""
+    env = GridNavi(size=3)
+    try:
+        one, other = (render.film(env, row, jnp.zeros((1, 2), jnp.int32), 32, 24) for row in (1, 5))
+    except InputError as error:
+        pytest.skip(str(error))
+    assert np.any(one != other)

@@ -6,15 +6,19 @@ first ones and earn more in the others. The best that can be earned so is known 
 
 import abc
 import dataclasses
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
+from mtjax.envs.looks import Look
+from mtjax.envs.pixels import Mark, Pictured
 from mtjax.envs.task_table import Table
 from mtjax.types import Array, InputError, Key, Step, Task
 
@@ -137,7 +141,7 @@ _MOVES = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
 
 
 @dataclasses.dataclass(frozen=True)
-class GridNavi(HiddenTasks):
+class GridNavi(Pictured, HiddenTasks):
     """GridNavi: walk through a grid to a hidden goal cell, which every trial draws (Zintgraf et al. 2020, "VariBAD").
 
     Observation (size^2,): 1 for the cell (x, y) at place ``size x + y``, else 0.
@@ -164,6 +168,8 @@ class GridNavi(HiddenTasks):
 
     action_size: ClassVar[int] = len(_MOVES)
     numbers_are: ClassVar[str] = "goal"
+    step_seconds: ClassVar[float] = 0.25  # of a film
+    hides: ClassVar[tuple[str, ...]] = ("goal",)
 
     def __post_init__(self):
         super().__post_init__()
@@ -173,8 +179,8 @@ class GridNavi(HiddenTasks):
             raise InputError(f"steps must be at least 1 and at most 10000, not {self.steps}")
 
     @property
-    def episode_length(self) -> int:
-        """Return the steps after which an episode is cut off."""
+    def episode_steps(self) -> int:  # type: ignore[override]
+        """Return the steps after which an episode is cut off, each of which an action may repeat."""
         return self.steps
 
     @property
@@ -186,12 +192,41 @@ class GridNavi(HiddenTasks):
         return cells[cells.max(axis=1) > 1]
 
     def reset(self, task: Task, key: Key) -> Step:
-        return self._step(task, jnp.zeros(2, jnp.int32))
+        cell = jnp.zeros(2, jnp.int32)
+        return Step(cell, self.look_at(task, cell), jnp.float32(0), jnp.bool_(False))
 
-    def step(self, task: Task, state: Array, action: Array) -> Step:
-        return self._step(task, jnp.clip(state + jnp.asarray(_MOVES)[self.chosen(action)], 0, self.size - 1))
+    def advance(self, task: Task, state: Array, action: Array) -> Array:
+        """Return the cell (2,) int32 after a move."""
+        return jnp.clip(state + jnp.asarray(_MOVES)[self.chosen(action)], 0, self.size - 1)
 
-    def _step(self, task: Task, cell: Array) -> Step:
-        reward = jnp.where(jnp.all(cell == task.goal["task"]), 1.0, -0.1)
-        obs = jax.nn.one_hot(self.size * cell[0] + cell[1], self.size**2)
-        return Step(cell, obs, reward, jnp.bool_(False))
+    def observe(self, task: Task, state: Array) -> Array:
+        """Return the cell, one-hot."""
+        return jax.nn.one_hot(self.size * state[0] + state[1], self.size**2)
+
+    def reward(self, task: Task, state: Array, action: Array) -> Array:
+        """Return 1 in the goal and -0.1 elsewhere, ()."""
+        return jnp.where(jnp.all(state == task.goal["task"]), 1.0, -0.1)
+
+    # What is seen.
+
+    @property
+    def look(self) -> Look:  # type: ignore[override]
+        """Return the view from above."""
+        middle = (self.size - 1) / 2
+        light = (middle, middle, 9.0)
+        return Look(camera=(middle, middle, 1.3 * self.size), tilt=0.0, light=light, diffuse=0.2, sun=True)
+
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return the cells, the walker, and the goal, which pictures that agents observe do not show."""
+        spec, geom = mujoco.MjSpec(), mujoco.mjtGeom
+        spec.stat.extent = 2.0  # nothing is drawn within a hundredth of it
+        add = spec.worldbody.add_geom
+        for x, y in np.ndindex(self.size, self.size):
+            add(type=geom.mjGEOM_BOX, pos=[x, y, 0], size=[0.48, 0.48, 0.05], rgba=(0.45, 0.5, 0.55, 1.0))
+        add(name="goal", type=geom.mjGEOM_CYLINDER, size=[0.4, 0.05, 0], rgba=(0.2, 0.8, 0.3, 1.0))
+        add(name="walker", type=geom.mjGEOM_CYLINDER, size=[0.3, 0.3, 0], rgba=(0.95, 0.6, 0.2, 1.0))
+        return spec
+
+    def marks(self, task: Task, state: Array) -> dict[str, Mark]:
+        """Return where the walker and the goal are."""
+        return {"goal": Mark(jnp.append(task.goal["task"], 0.06)), "walker": Mark(jnp.append(state, 0.3))}

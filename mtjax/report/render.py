@@ -70,7 +70,7 @@ def drawing(
     Raises:
         InputError: there is no such row, or no OpenGL backend works. The message names what to install.
     """
-    count = env.variation.count
+    count = len(env.table.tasks.row)
     if not 0 <= task_row < count:
         raise InputError(f"there is no task {task_row}; this family has tasks 0 to {count - 1}")
     model = env.scene_model(task_row)

@@ -11,10 +11,14 @@ from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from mtjax.envs.family import Family
+from mtjax.envs.looks import Look
 from mtjax.envs.parameters import Parameter, positive
+from mtjax.envs.pixels import Pictured
+from mtjax.envs.scenery import Visible
 from mtjax.types import Array, Key, Step, Task
 
 _TRACK = 2.4  # [m] from the centre to either end
@@ -26,6 +30,10 @@ _ACROBOT_GRAVITY = 9.8  # [m/s^2]
 _CENTRE_OF_MASS = 0.5  # [m] along each link, whatever its length
 _INERTIA = 1.0  # [kg m^2] of each link about its centre of mass
 _TOP_SPEEDS = (5 * math.pi, 11 * math.pi)  # [rad/s] of the joints
+
+_SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+_BOX, _CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
+_GREY, _BLUE, _ORANGE, _GREEN = (0.5, 0.5, 0.5, 1), (0.25, 0.45, 0.75, 1), (0.9, 0.6, 0.2, 1), (0.3, 0.75, 0.35, 1)
 
 
 class CartPoleState(NamedTuple):
@@ -50,7 +58,7 @@ def choose(action: Array, count: int) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class CartPole(Family):
+class CartPole(Pictured, Family):
     """Cart-pole: keep a pole upright on a cart that is always pushed one way or the other.
 
     Observation (4,): position of the cart [m], its velocity [m/s], angle of the pole from upright [rad], its velocity
@@ -87,16 +95,45 @@ class CartPole(Family):
     cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 500
     action_size: ClassVar[int] = 1
+    step_seconds: ClassVar[float] = _CARTPOLE_DT
+    look: ClassVar[Look | None] = Look(camera=(0.0, -6.0, 0.8), tilt=90.0)
+    scenic: ClassVar[tuple[str, ...]] = ("pole-length",)
 
     def reset(self, task: Task, key: Key) -> Step:
         state = CartPoleState(*jax.random.uniform(key, (4,), jnp.float32, -0.05, 0.05))
-        return Step(state, jnp.stack(state), jnp.float32(0), jnp.bool_(False))
+        return Step(state, self.look_at(task, state), jnp.float32(0), jnp.bool_(False))
 
-    def step(self, task: Task, state: CartPoleState, action: Array) -> Step:
+    def advance(self, task: Task, state: CartPoleState, action: Array) -> CartPoleState:
+        """Return the cart-pole after a push."""
         force = jnp.where(choose(action[0], 2) == 1, task.goal["force"], -task.goal["force"])
-        state = _move_cartpole(task.goal, state, force)
-        fallen = (jnp.abs(state.position) > _TRACK) | (jnp.abs(state.angle) > _FALLEN)
-        return Step(state, jnp.stack(state), jnp.float32(1), fallen)
+        return _move_cartpole(task.goal, state, force)
+
+    def observe(self, task: Task, state: CartPoleState) -> Array:
+        """Return the four numbers of the state."""
+        return jnp.stack(state)
+
+    def reward(self, task: Task, state: CartPoleState, action: Array) -> Array:
+        return jnp.float32(1)
+
+    def terminates(self, task: Task, state: CartPoleState) -> Array:
+        """Return whether () the cart has left its track or the pole has fallen."""
+        return (jnp.abs(state.position) > _TRACK) | (jnp.abs(state.angle) > _FALLEN)
+
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return the track, the cart and the pole."""
+        spec, length = mujoco.MjSpec(), 2 * (values or {}).get("pole-length", self.parameters["pole-length"].nominal)
+        spec.worldbody.add_geom(type=_BOX, pos=[0, 0.1, 0], size=[_TRACK, 0.02, 0.04], rgba=_GREY)
+        cart = spec.worldbody.add_body()
+        cart.add_joint(type=_SLIDE, axis=[1, 0, 0])
+        cart.add_geom(type=_BOX, size=[0.35, 0.1, 0.18], rgba=_BLUE)
+        pole = cart.add_body()
+        pole.add_joint(type=_HINGE, axis=[0, 1, 0])
+        pole.add_geom(type=_CAPSULE, fromto=[0, -0.2, 0, 0, -0.2, length], size=[0.08, 0, 0], rgba=_ORANGE)
+        return spec
+
+    def visible(self, task: Task, state: CartPoleState) -> Visible:
+        """Return where the cart and the pole are."""
+        return Visible(jnp.stack([state.position, state.angle]))
 
 
 def _move_cartpole(goal: Mapping[str, Array], state: CartPoleState, force: Array) -> CartPoleState:
@@ -112,7 +149,7 @@ def _move_cartpole(goal: Mapping[str, Array], state: CartPoleState, force: Array
 
 
 @dataclasses.dataclass(frozen=True)
-class Acrobot(Family):
+class Acrobot(Pictured, Family):
     """Acrobot: swing the end of a two-link arm above the height of its first link, with a motor at the elbow alone.
 
     Observation (6,): cosine and sine of the first joint's angle from hanging down; cosine and sine of the second
@@ -153,23 +190,48 @@ class Acrobot(Family):
     cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 500
     action_size: ClassVar[int] = 1
+    step_seconds: ClassVar[float] = _ACROBOT_DT
+    film_speed: ClassVar[float] = 3.0
+    look: ClassVar[Look | None] = Look(camera=(0.0, -6.0, 0.0), tilt=90.0)
 
     def reset(self, task: Task, key: Key) -> Step:
-        start = jax.random.uniform(key, (2, 2), jnp.float32, -0.1, 0.1)
-        state = AcrobotState(*start)
-        return Step(state, _observe_acrobot(state), jnp.float32(0), jnp.bool_(False))
+        state = AcrobotState(*jax.random.uniform(key, (2, 2), jnp.float32, -0.1, 0.1))
+        return Step(state, self.look_at(task, state), jnp.float32(0), jnp.bool_(False))
 
-    def step(self, task: Task, state: AcrobotState, action: Array) -> Step:
+    def advance(self, task: Task, state: AcrobotState, action: Array) -> AcrobotState:
+        """Return the arm after a step under a torque."""
         torque = (choose(action[0], 3) - 1) * jnp.where(task.goal["torque-sign"] > 0, 1.0, -1.0)
-        state = _move_acrobot(task.goal, state, torque)
+        return _move_acrobot(task.goal, state, torque)
+
+    def observe(self, task: Task, state: AcrobotState) -> Array:
+        """Return the angles' cosines and sines, and the velocities."""
+        turns = jnp.stack([jnp.cos(state.angles), jnp.sin(state.angles)], axis=1)
+        return jnp.concatenate([turns.ravel(), state.velocities])
+
+    def reward(self, task: Task, state: AcrobotState, action: Array) -> Array:
+        """Return 0 above the height and -1 below it, ()."""
+        return jnp.where(self.terminates(task, state), 0.0, -1.0)
+
+    def terminates(self, task: Task, state: AcrobotState) -> Array:
+        """Return whether () the end of the arm is above the height."""
         first, second = state.angles
-        there = -jnp.cos(first) - jnp.cos(first + second) > 1
-        return Step(state, _observe_acrobot(state), jnp.where(there, 0.0, -1.0), there)
+        return -jnp.cos(first) - jnp.cos(first + second) > 1
 
+    def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
+        """Return links of 1 m, as the height that counts is that of such, and a bar at this height."""
+        spec, whole = mujoco.MjSpec(), [0, 0, 0, 0, 0, -1]
+        spec.worldbody.add_geom(type=_BOX, pos=[0, 0.2, 1], size=[2, 0.02, 0.04], rgba=_GREEN)
+        upper = spec.worldbody.add_body()
+        upper.add_joint(type=_HINGE, axis=[0, -1, 0])
+        upper.add_geom(type=_CAPSULE, fromto=whole, size=[0.12, 0, 0], rgba=_BLUE)
+        lower = upper.add_body(pos=[0, 0, -1])
+        lower.add_joint(type=_HINGE, axis=[0, -1, 0])
+        lower.add_geom(type=_CAPSULE, fromto=whole, size=[0.1, 0, 0], rgba=_ORANGE)
+        return spec
 
-def _observe_acrobot(state: AcrobotState) -> Array:
-    turns = jnp.stack([jnp.cos(state.angles), jnp.sin(state.angles)], axis=1)
-    return jnp.concatenate([turns.ravel(), state.velocities])
+    def visible(self, task: Task, state: AcrobotState) -> Visible:
+        """Return the angles of the joints."""
+        return Visible(state.angles)
 
 
 def _move_acrobot(goal: Mapping[str, Array], state: AcrobotState, torque: Array) -> AcrobotState:
