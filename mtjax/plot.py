@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from mtjax.command import imports, parsing, process, refusals
 from mtjax.names import SPLITS, InputError, become, command, load, nearest_error
 
-FIGURES = ("curves", "families", "parameter", "iqm", "profile", "improvement", "posterior", "all")
+FIGURES = ("auto", "curves", "families", "parameter", "iqm", "profile", "improvement", "posterior", "all")
 ENDINGS = (".png", ".pdf", ".svg")
 
 
@@ -17,11 +17,11 @@ class Request:
     Runs with equal settings and other seeds are one line. Intervals are over seeds, of three or more.
     """
 
-    figure: str = "curves"
-    """curves (return over steps, of one family), families (the same in a grid), parameter (return over the varied
-    parameter), iqm (interquartile means of agents), profile (share of seeds and tasks above a return), improvement
-    (probability of improvement over a baseline), posterior (what an agent believes of its task over a trial, of one
-    run), or all that the runs allow."""
+    figure: str = "auto"
+    """auto (curves, or families if the runs are of several), curves (return over steps, of one family), families (the
+    same in a grid), parameter (return over the varied parameter), iqm (interquartile means of agents), profile (share
+    of seeds and tasks above a return), improvement (probability of improvement over a baseline), posterior (what an
+    agent believes of its task over a trial, of one run), or all that the runs allow."""
     split: str = "train"
     """train, interpolation or extrapolation: whose returns are drawn."""
     metric: str = "return"
