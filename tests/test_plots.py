@@ -137,6 +137,18 @@ def test_python_draws_what_the_command_draws(runs, tmp_path):
             mtjax.plot(runs, **given)
 
 
+def test_own_files_of_all_runs_are_asked_for_at_once(runs, tmp_path):
+    """And none of them runs by itself."""
+    files = [tmp_path / f"own_{name}.py" for name in ("one", "two")]
+    for name, own in zip("ac", files, strict=True):
+        own.write_text("raise SystemExit\n")
+        path = next((tmp_path / "runs").glob(f"{name}*")) / "config.json"
+        record = json.loads(path.read_text())
+        path.write_text(json.dumps({**record, "env": "own", "imports": [str(own)]}))
+    with pytest.raises(InputError, match=" ".join(rf"--import=\S+{file.name}" for file in files)):
+        mtjax.plot.main([runs])
+
+
 def test_by_default_curves_are_drawn_of_every_family(runs, tmp_path, monkeypatch):
     """In a grid if there are several, by the command and in Python; what was asked for by name is not changed."""
     monkeypatch.chdir(tmp_path)
