@@ -3,13 +3,15 @@
 import io
 import re
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rich
 
 from mtjax.names import InputError
-from mtjax.report import waiting
+from mtjax.report import films, waiting
 from mtjax.training import console as consoles
 from mtjax.training.console import Clock, Console
 
@@ -130,6 +132,21 @@ def test_what_lasts_is_told_again(monkeypatch, capsys, at_once):
     assert first == ("playing" if at_once else "playing: 0 s") and {*lines} == {"playing: 0 s"}
     time.sleep(0.03)
     assert capsys.readouterr() == ("", "")
+
+
+def test_playing_for_a_film_is_told(monkeypatch, capsys):
+    """As its program compiles for seconds before the first task is drawn."""
+
+    def play(*_):
+        time.sleep(0.1)
+        raise InputError("enough")
+
+    monkeypatch.setattr(waiting, "_SOON", 0.01)
+    monkeypatch.setattr(films, "play", play)
+    policy, tasks = SimpleNamespace(env=None), SimpleNamespace(id=[0, 1])
+    with pytest.raises(InputError, match="enough"):
+        films.write(policy, tasks, [], 1.0, 0, Path("film"), {})  # type: ignore
+    assert capsys.readouterr().out == "playing 2 tasks for the film: 0 s\n"
 
 
 def test_quiet_console_is_quiet(capsys):
