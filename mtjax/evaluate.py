@@ -5,18 +5,28 @@ import math
 from collections.abc import Sequence
 
 from mtjax.checks import require_episodes, require_run
-from mtjax.command import flags, imports, parsing, process, refusals
+from mtjax.command import flags, help, imports, parsing, process, refusals
 from mtjax.names import SPLITS, InputError, become, command, load, nearest_error
 from mtjax.saved import pretrained
 
+_PROGRAM = "python -m mtjax.evaluate"
+_WAYS = {
+    "--run=RUN [FLAGS]": "",
+    "--run=RUN --env.vary.NAME=VALUES": "on other values of a parameter: lo:hi:n or a,b,c",
+    "--run=RUN --video": "film some tasks too",
+    "--run=RUN --view": "show the run on a page, as it learns",
+    "--run=RUN --import=FILE.py": "first run a file that registers your own",
+}
+_GROUPS = (
+    ("what is played", "evaluate.py", "Played"),
+    ("films", "evaluate.py", "Filmed"),
+    ("what else is done", "evaluate.py", "Request"),
+)
+
 
 @dataclasses.dataclass(frozen=True)
-class Request:
-    """Evaluate a trained run: ``python -m mtjax.evaluate --run=DIR``.
-
-    ``--env.vary.NAME=VALUES`` evaluates on other values of a parameter: lo:hi:n or a list a,b,c. ``--import=FILE``
-    reads a file of your own first, as the run did.
-    """
+class Played:
+    """Says which run plays, and how."""
 
     run: str = ""
     """The run's folder, in which a new folder takes returns and a plot. Or the name of a trained policy that comes with
@@ -33,6 +43,12 @@ class Request:
     """Seed of other goals than the run's, or other tasks, where they are drawn; -1 takes the run's own."""
     checkpoint: int = 0
     """Iteration of the checkpoint to evaluate, as its folder in checkpoints/ is called; 0 takes the newest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Filmed:
+    """Says what is filmed."""
+
     video: bool = False
     """Film episodes of some tasks of each split, in one grid that names each (mp4 if ffmpeg is installed, else gif)."""
     video_splits: tuple[str, ...] = ()
@@ -41,6 +57,12 @@ class Request:
     """Numbers of the tasks to film in each split, counted from 0; by default the first, the middle and the last."""
     video_seconds: float = 10.0
     """Seconds that the film lasts. Slow worlds, such as a boat's, are shown faster than they are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Request(Filmed, Played):
+    """Evaluate a trained run: ``python -m mtjax.evaluate --run=RUN``."""
+
     export: str = ""
     """File to write the first seed's policy into: one that ends with .npz for mtjax/saved/standalone.py, which
     reads it with NumPy or JAX alone, or with .onnx for other runtimes."""
@@ -60,6 +82,8 @@ class Request:
 @command
 def main(argv: Sequence[str]) -> None:
     """Read the command line first, then import the evaluation code and score the run."""
+    if {"--help", "-h"} & {*argv}:
+        return print(help.overview(_PROGRAM, _WAYS, _GROUPS))
     request, vary = _parse(argv)
     load("mtjax.report.view:show" if request.view else "mtjax.report.scoring:report")(request, vary)
 
@@ -70,7 +94,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
         raise InputError(f"say which run to evaluate by --run={argv[0]}")
     vary, argv = flags.vary_flags(imports.import_files(flags.with_port(argv)))
     refusals.check_flags_of(Request, argv)
-    request = parsing.parse_with_tyro(Request, argv, Request(), "python -m mtjax.evaluate")
+    request = parsing.parse_with_tyro(Request, argv, Request(), _PROGRAM)
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
     require_episodes(request.episodes, request.seed, request.drawn, request.checkpoint)

@@ -3,7 +3,16 @@
 from collections.abc import Sequence
 
 from mtjax.command import flag_files, help, imports, process, refusals
+from mtjax.command.class_sources import OF_EVERY_RUN
 from mtjax.names import become, command, load
+
+_WAYS = {
+    "[--env=NAME] [--agent=NAME] [FLAGS]": "",
+    "--env=NAME --agent=NAME --help": "all flags of these, with defaults",
+    "--list": "all families and agents",
+    "--import=FILE.py ...": "first run a file that registers your own",
+    "--resume=RUN": "go on with a run",
+}
 
 
 @command
@@ -20,7 +29,7 @@ def _run(argv: Sequence[str]) -> None:
     if len(words) == len(argv):  # else the full parser checks the flags of the user's own classes
         refusals.check_flags(words)
     if words in (["--help"], ["-h"]):
-        print(help.overview())
+        print(help.overview("python -m mtjax.train", _WAYS, OF_EVERY_RUN))
         return
     if "--list" in words:
         print(help.catalogue())

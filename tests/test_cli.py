@@ -22,12 +22,13 @@ from own_process import environment
 from probes import FEW, OFF_POLICY, family_for, one_in, slow_but
 
 import mtjax.evaluate
+import mtjax.plot
 import mtjax.train
 from mtjax.agents import AGENTS
 from mtjax.agents import settings as settings_of
 from mtjax.agents.hyperparameters import CHOICES
 from mtjax.agents.parts.representations import DeepMDP
-from mtjax.command import flag_files, process, run_config
+from mtjax.command import class_sources, flag_files, process, run_config
 from mtjax.command.run_config import parse
 from mtjax.config import Plan, for_tasks, load_preset, with_preset
 from mtjax.envs import BENCHMARKS, ENVS, SUITES
@@ -426,14 +427,19 @@ def test_help_mentions_every_flag_with_its_default(help_text):
         assert f"(default: {' '.join(map(str, widths))})" in help_text
 
 
-@pytest.mark.parametrize("words", [["--help"], ["-h"]])
-def test_evaluate_has_help(words, capsys):
-    """It names its few flags."""
-    with pytest.raises(SystemExit) as stop:
-        mtjax.evaluate.main(words)
-    assert not stop.value.code
-    text = capsys.readouterr().out
-    assert all(flag in text for flag in ("--run", "--episodes", "--seed", "--video")) and "``" not in text
+@pytest.mark.parametrize("word", ["--help", "-h"])
+@pytest.mark.parametrize("name, main", [*COMMANDS.items(), ("plot", mtjax.plot.main)])
+def test_help_of_every_command_has_one_form(name, main, word, capsys):
+    """How to call it, and groups of flags, each of which stands once, with its default and what it does."""
+    main([word])
+    usage, *groups = capsys.readouterr().out.strip().split("\n\n")
+    calls = [line[7:] for line in usage.splitlines()]
+    assert usage.startswith("usage: ") and all(call.startswith(f"python -m mtjax.{name} ") for call in calls)
+    assert any("--import=FILE.py" in call for call in calls) and all(re.match(r"\w.*:\n  --", text) for text in groups)
+    flags = re.findall(r"^  --([\w-]+)(?:=.+)?\n {6}\w", "\n\n".join(groups), re.MULTILINE)
+    fields = dataclasses.fields(getattr(mtjax, name).Request) if name != "train" else ()
+    own = {field.name.replace("_", "-") for field in fields} or class_sources.whole_flags()
+    assert own <= {*flags} and len(flags) == len({*flags})
 
 
 def test_list_names_every_family_and_agent(capsys):

@@ -2,11 +2,16 @@
 
 import io
 import re
+import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rich
 
+from mtjax.names import InputError
+from mtjax.report import films, waiting
 from mtjax.training import console as consoles
 from mtjax.training.console import Clock, Console
 
@@ -113,6 +118,35 @@ def test_evaluations_name_splits_and_worst_tasks(capsys):
     success = {"train": np.array([[[1.0, 0.0], [np.nan, np.nan]]]), "extrapolation": np.full((1, 1, 2), np.nan)}
     Console(10).evaluation(5, {**returns, "extrapolation": np.ones((1, 1, 2))}, success)
     assert capsys.readouterr().out == "evaluation at 5 steps: train 6 (worst task 2), success 0.50, extrapolation 1\n"
+
+
+@pytest.mark.parametrize("at_once", [False, True])
+def test_what_lasts_is_told_again(monkeypatch, capsys, at_once):
+    """Until it ends, whatever its end; at once if that was asked for."""
+    monkeypatch.setattr(waiting, "_SOON", 0.01)
+    monkeypatch.setattr(waiting, "_OFTEN", 0.01)
+    with pytest.raises(InputError), waiting.telling("playing", at_once=at_once):
+        time.sleep(0.1)
+        raise InputError("ended")
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert first == ("playing" if at_once else "playing: 0 s") and {*lines} == {"playing: 0 s"}
+    time.sleep(0.03)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_playing_for_a_film_is_told(monkeypatch, capsys):
+    """As its program compiles for seconds before the first task is drawn."""
+
+    def play(*_):
+        time.sleep(0.1)
+        raise InputError("enough")
+
+    monkeypatch.setattr(waiting, "_SOON", 0.01)
+    monkeypatch.setattr(films, "play", play)
+    policy, tasks = SimpleNamespace(env=None), SimpleNamespace(id=[0, 1])
+    with pytest.raises(InputError, match="enough"):
+        films.write(policy, tasks, [], 1.0, 0, Path("film"), {})  # type: ignore
+    assert capsys.readouterr().out == "playing 2 tasks for the film: 0 s\n"
 
 
 def test_quiet_console_is_quiet(capsys):

@@ -257,6 +257,14 @@ def test_every_extra_is_listed():
     assert [name for name in extras if not re.search(rf"^\| .*`{name}`.* \|", listed, re.M)] == []
 
 
+def test_a_chosen_device_leads_to_where_devices_are_chosen():
+    """Which is on the page that a newcomer reads; who meets an error is led there."""
+    guide, variables = ROOT / "docs" / "guide", ("JAX_PLATFORMS=", "CUDA_VISIBLE_DEVICES=")
+    section = (guide / "install.md").read_text().partition("\n## Which device\n")[2].partition("\n## ")[0]
+    assert all(variable in section for variable in variables)
+    assert "(install.md#which-device)" in (guide / "troubleshooting.md").read_text()
+
+
 @needs("mkdocs")
 def test_the_search_ranks_what_explains_before_tables(hooks):
     page = lambda place: SimpleNamespace(file=SimpleNamespace(src_uri=place), meta={})

@@ -137,6 +137,30 @@ def test_python_draws_what_the_command_draws(runs, tmp_path):
             mtjax.plot(runs, **given)
 
 
+def test_own_files_of_all_runs_are_asked_for_at_once(runs, tmp_path):
+    """And none of them runs by itself."""
+    files = [tmp_path / f"own_{name}.py" for name in ("one", "two")]
+    for name, own in zip("ac", files, strict=True):
+        own.write_text("raise SystemExit\n")
+        path = next((tmp_path / "runs").glob(f"{name}*")) / "config.json"
+        record = json.loads(path.read_text())
+        path.write_text(json.dumps({**record, "env": "own", "imports": [str(own)]}))
+    with pytest.raises(InputError, match=" ".join(rf"--import=\S+{file.name}" for file in files)):
+        mtjax.plot.main([runs])
+
+
+def test_by_default_curves_are_drawn_of_every_family(runs, tmp_path, monkeypatch):
+    """In a grid if there are several, by the command and in Python; what was asked for by name is not changed."""
+    monkeypatch.chdir(tmp_path)
+    for given, name, count in ((runs, "families", 2), (runs.replace("*", "[ab]*"), "curves", 1)):
+        mtjax.plot.main([given])
+        assert [path.name for path in tmp_path.glob("*.png")] == [f"{name}.png"]
+        (tmp_path / f"{name}.png").unlink()
+        assert np.size(mtjax.plot(given)) == count
+    with pytest.raises(InputError, match="the figure curves is of one family"):
+        mtjax.plot(runs, "curves")
+
+
 def test_aggregates_are_those_of_all_tasks_of_all_families(runs, make_run):
     """Against the functions that compute them; an agent that lacks a family is refused."""
     found = read_runs.learned(runs)
@@ -203,7 +227,7 @@ def test_a_metric_is_drawn_in_the_place_of_returns(runs, make_run, tmp_path, mon
 
 def test_every_figure_has_a_name():
     """The command's list is read without importing what draws."""
-    assert (*plots.FIGURES, "all") == mtjax.plot.FIGURES and plots.ENDINGS == mtjax.plot.ENDINGS
+    assert ("auto", *plots.FIGURES, "all") == mtjax.plot.FIGURES and plots.ENDINGS == mtjax.plot.ENDINGS
 
 
 @pytest.mark.parametrize(

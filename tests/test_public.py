@@ -6,6 +6,7 @@ import inspect
 import pydoc
 import subprocess
 import sys
+import time
 import traceback
 
 import jax
@@ -18,7 +19,9 @@ import mtjax
 from mtjax import report
 from mtjax.command import api
 from mtjax.evaluate import main
+from mtjax.learning.evaluation import Scores
 from mtjax.names import public
+from mtjax.report import waiting
 from mtjax.types import InputError
 
 FUNCTIONS = [name for name in mtjax.__all__ if inspect.isfunction(getattr(mtjax, name))]
@@ -201,6 +204,22 @@ def test_wrong_arguments_are_refused_before_anything_is_compiled(result, monkeyp
     monkeypatch.setattr("mtjax.report.scoring.score", lambda *_: pytest.fail("was played"))
     with pytest.raises(InputError, match=said):
         mtjax.evaluate(result, **given)
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_an_evaluation_that_takes_long_says_what_it_plays(result, monkeypatch, capsys, quiet):
+    """Unless it is to be quiet; a short one says nothing."""
+
+    def score(policy, episodes, seed, tasks, split):
+        time.sleep(0.1)
+        return {split: Scores(np.ones((2, len(policy.env.tasks(split).id), episodes.count)), {})}
+
+    monkeypatch.setattr("mtjax.report.scoring.score", score)
+    mtjax.evaluate(result, split="train", episodes=3, quiet=quiet)
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(waiting, "_SOON", 0.01)
+    mtjax.evaluate(result, split="train", episodes=3, quiet=quiet)
+    assert capsys.readouterr().out == "playing 6 episodes: 0 s\n" * (not quiet)
 
 
 @pytest.mark.parametrize("run", [None, 3, "nowhere", ShortFinger()])

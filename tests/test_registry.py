@@ -550,7 +550,5 @@ def test_unknown_names_of_a_run_mention_import(tmp_path):
 
 
 def test_the_list_says_what_varies():
-    """And the help how to import."""
     lines = help.catalogue().splitlines()
     assert any("finger-spin-vary-size " in line and "[size=0.95:1.13:10]" in line for line in lines)
-    assert "--import=FILE.py" in help.overview()

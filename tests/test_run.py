@@ -565,12 +565,14 @@ def test_both_clocks_go_on(play, tmp_path):
     assert result.trained_seconds == pytest.approx(result.seconds - 1000)  # those of this process
 
 
-def test_finished_run_has_nothing_to_resume(play, whole, tmp_path, capsys):
-    """Resuming it changes nothing, and a line says what would go on."""
+def test_finished_run_has_nothing_to_resume(play, whole, tmp_path, capsys, monkeypatch):
+    """Resuming it changes nothing and compiles nothing, and a line says what would go on."""
     shutil.copytree(whole.directory, tmp_path, dirs_exist_ok=True)
+    monkeypatch.setattr(run, "compile_lowered", None)
     result = play(tmp_path, resume=True, quiet=False)
-    assert "the run has made all its" in capsys.readouterr().out
-    assert result.finished and not result.rows
+    out = capsys.readouterr().out
+    assert "the run has made all its" in out and "compil" not in out
+    assert result.finished and not result.rows and result.seconds == pytest.approx(whole.seconds, abs=1e-3)
     assert_same_run(result, whole)
 
 

@@ -1,9 +1,10 @@
 """What ``--help`` and ``--list`` print. This module needs no JAX."""
 
 import textwrap
+from collections.abc import Iterable, Mapping
 
 from mtjax.agents import AGENTS
-from mtjax.command.class_sources import OF_EVERY_RUN, documented_fields
+from mtjax.command.class_sources import documented_fields
 from mtjax.envs import BENCHMARKS, ENVS, SUITES, outline, varied
 from mtjax.saved import pretrained
 
@@ -25,16 +26,19 @@ def catalogue() -> str:
     return "\n".join(lines + [f"  {name}" for name in pretrained.names()])
 
 
-def overview() -> str:
-    """Return what ``--help`` alone says: the flags of every run, read from the classes' source as JAX is not needed."""
-    lines = [
-        "usage: python -m mtjax.train [--env=NAME] [--agent=NAME] [FLAGS]",
-        "       python -m mtjax.train --env=NAME --agent=NAME --help    all flags of these, with defaults",
-        "       python -m mtjax.train --list                            all families and agents",
-        "       python -m mtjax.train --import=FILE.py ...              first run a file that registers your own",
-        "       python -m mtjax.train --resume=RUN                      go on with a run",
-    ]
-    for title, file, cls in OF_EVERY_RUN:
+def overview(program: str, ways: Mapping[str, str], groups: Iterable[tuple[str, str, str]]) -> str:
+    """Return what a command's ``--help`` says: how to call it, and its flags.
+
+    They are read from the classes' source, as JAX is not needed.
+
+    Args:
+        ways: what may follow the program's name, and what that does.
+        groups: titles, and the files and names of the classes whose fields are flags.
+    """
+    width = max(map(len, ways))
+    calls = [f"{program} {words:{width}}    {says}".rstrip() for words, says in ways.items()]
+    lines = [f"usage: {calls[0]}", *(f"       {call}" for call in calls[1:])]
+    for title, file, cls in groups:
         lines += ["", f"{title}:"]
         for flag, _, default, text in documented_fields(file, cls):
             lines.append(f"  --{flag + default}")

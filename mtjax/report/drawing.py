@@ -11,11 +11,13 @@ from mtjax.report import plots, read_runs
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_AUTO = "auto"
+
 
 @public
 def plot(
     runs: Any = "runs/*",
-    figure: str = "curves",
+    figure: str = "auto",
     *,
     split: str = "train",
     metric: str = "return",
@@ -26,8 +28,8 @@ def plot(
 
     Args:
         runs: folders, or patterns such as "runs/*"; or results of ``mtjax.train``, also by name in a mapping.
-        figure: curves, families (which returns several axes), parameter, iqm, profile, improvement, or posterior of one
-            run (several axes too), which may also be a policy.
+        figure: auto (curves, or families if the runs are of several), curves, families (which returns several axes),
+            parameter, iqm, profile, improvement, or posterior of one run (several axes too), which may be a policy.
         split: train, interpolation or extrapolation: whose returns are drawn.
         metric: "return", or what else evaluations have, such as "success".
         baseline: the agent that improvement compares with; by default the first run's.
@@ -36,9 +38,10 @@ def plot(
     Raises:
         InputError: there is no such figure or run, or the runs do not allow it.
     """
-    if figure not in plots.FIGURES:
-        raise nearest_error("figure", figure, plots.FIGURES)
-    axes = _draw(figure, runs, lambda: _learned(runs, metric), split, baseline)
+    if figure not in (_AUTO, *plots.FIGURES):
+        raise nearest_error("figure", figure, (_AUTO, *plots.FIGURES))
+    found = cache(lambda: _learned(runs, metric))
+    axes = _draw(_named(figure, found), runs, found, split, baseline)
     if out:
         plots.save(axes, out)
     return axes
@@ -48,13 +51,13 @@ def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: st
     """Draw a figure of runs, or all that these runs allow, and print the files.
 
     Args:
-        figure: a name of ``plots.FIGURES``, or "all".
+        figure: a name of ``plots.FIGURES``, "auto" or "all".
         metric: "return", or another score of evaluations.
         out: the file to write; of all figures, the ending counts and the names follow from the stem.
     """
     found = cache(lambda: _learned(runs, metric))
-    names = list(plots.FIGURES) if figure == "all" else [figure]
-    path = Path(out or ("runs.png" if figure == "all" else f"{figure}.png"))
+    names = list(plots.FIGURES) if figure == "all" else [_named(figure, found)]
+    path = Path(out or ("runs.png" if figure == "all" else f"{names[0]}.png"))
     drawn = 0
     for name in names:
         file = path if figure != "all" else path.with_name(f"{path.stem}-{name}{path.suffix}")
@@ -73,6 +76,13 @@ def draw(runs: Sequence[str], figure: str, split: str, metric: str, baseline: st
 
 def _learned(runs: Any, metric: str) -> list[read_runs.Learned]:
     return read_runs.learned(runs) if metric == "return" else read_runs.of_metric(runs, metric)
+
+
+def _named(figure: str, learned: Callable[[], list[read_runs.Learned]]) -> str:
+    """Return the figure's name: for "auto" that of learning curves, of one family or of several."""
+    if figure != _AUTO:
+        return figure
+    return "families" if len({one.env for one in learned()}) > 1 else "curves"
 
 
 def _draw(

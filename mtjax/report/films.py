@@ -24,6 +24,7 @@ from mtjax.learning.evaluation import Recording, record, span_of
 from mtjax.names import InputError
 from mtjax.report import render, timeline
 from mtjax.report.timeline import Timeline
+from mtjax.report.waiting import telling
 from mtjax.saved.policy import Policy
 from mtjax.types import SPLITS, Task
 
@@ -114,16 +115,17 @@ def write(
         sampled: draw actions from the policy.
     """
     env = policy.env
-    played, by_name = play(policy, tasks, seed, sampled)
+    with telling(f"playing {len(tasks.id)} tasks for the film"):
+        played, by_name = play(policy, tasks, seed, sampled)
     acting, (chosen, columns) = timeline.timeline_of(env, played, by_name), _episodes(chosen, played)
     width = _width(len(chosen), _WIDTHS)
     count, tiles = max(round(seconds * _FPS), 1), []
-    for i, one in enumerate(chosen):
-        print(f"filming {i + 1} of {len(chosen)}: {', '.join(_caption(env, one, played, named))}", flush=True)
-        tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, acting))
     captions = [_caption(env, one, played, named) for one in chosen]
-    print(f"writing the film of {count} pictures", flush=True)
-    path = render.write_video(stem, grid(captioned(tiles, captions), columns), _FPS)
+    for i, (one, caption) in enumerate(zip(chosen, captions, strict=True)):
+        with telling(f"filming {i + 1} of {len(chosen)}: {', '.join(caption)}", at_once=True):
+            tiles.append(_tile(env, one, played, by_name[one.part.name], count, width, acting))
+    with telling(f"writing the film of {count} pictures", at_once=True):
+        path = render.write_video(stem, grid(captioned(tiles, captions), columns), _FPS)
     print(f"filmed {path.name}: {len(chosen) // max(columns, 1)} tasks{f' by {columns} episodes' * bool(columns)}")
     if acting is not None:
         labels = [label for split in SPLITS for label in env.labels(split)]

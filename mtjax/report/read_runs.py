@@ -64,7 +64,7 @@ def read(pattern: str | Path | Iterable[str | Path]) -> list[Found]:
         above = next((each for each in map(str, given) if any(Path(each).glob("*/config.json"))), None)
         hint = "" if above is None else f"; its folders hold runs: {str(Path(glob.escape(above)) / '*')!r}"
         raise InputError(f"there is no run with an evaluation in {', '.join(map(str, given)) or 'an empty list'}{hint}")
-    return [_read(folder) for folder in done]
+    return [_read(folder, done) for folder in done]
 
 
 def _folders(pattern: str) -> list[Path]:
@@ -75,8 +75,8 @@ def _folders(pattern: str) -> list[Path]:
     return [folder for group in inside for folder in group if (folder / "config.json").is_file()]
 
 
-def _read(directory: Path) -> Found:
-    config = from_json(directory / "config.json")
+def _read(directory: Path, beside: Sequence[Path]) -> Found:
+    config = from_json(directory / "config.json", beside)
     named = (word.removeprefix("agent.").partition("=")[::2] for word in config.sweep)
     outside = {name: values for name, values in named if name.replace("-", "_") not in _swept(config)}
     return Found(directory, config, evaluations_of(config, directory), outside)

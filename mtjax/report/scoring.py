@@ -24,6 +24,7 @@ from mtjax.learning.evaluation import Episodes, Scores, of_tasks
 from mtjax.names import nearest_error, public
 from mtjax.report import diagnostics, figures, films
 from mtjax.report.tables import task_table
+from mtjax.report.waiting import telling
 from mtjax.saved import pretrained
 from mtjax.saved.config_json import from_json
 from mtjax.saved.export import export
@@ -81,6 +82,7 @@ def evaluate(
     task_seed: int | None = None,
     point: int = 0,
     checkpoint: int = 0,
+    quiet: bool = False,
 ) -> Evaluation:
     """Play episodes that no training has seen, as ``python -m mtjax.evaluate`` does, and return every return.
 
@@ -97,6 +99,7 @@ def evaluate(
         point: number of the setting, if the run holds several settings of a sweep; of a population, of the member,
             which plays alone.
         checkpoint: iteration of the checkpoint, if ``run`` is a folder; 0 takes the newest.
+        quiet: print nothing. Else a line says what is played, if that takes longer than two seconds.
 
     Raises:
         InputError: there is no such run, or an argument cannot be used.
@@ -111,7 +114,9 @@ def evaluate(
     policy, tasks, named = with_tasks(_policy(run, point, checkpoint), vary or {}, task_seed)
     if split is not None and not len(policy.env.tasks(split).id):
         raise InputError(f"this run has no tasks of the split {split}")
-    scores = score(policy, Episodes(episodes, policy.trial, sampled), seed, tasks, split or "all")
+    count = episodes * len(policy.env.tasks(split or "all").id)
+    with telling(f"playing {count} episodes", quiet):
+        scores = score(policy, Episodes(episodes, policy.trial, sampled), seed, tasks, split or "all")
     found = {named.get(name, name): (name, one) for name, one in scores.items() if one.returns.size}
     metrics = list(next(iter(scores.values())).metrics)
     return Evaluation(
@@ -171,7 +176,10 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         films.require(policy.env)
     if request.export:
         print(f"exported to {export(policy, request.export)}", flush=True)
-    found = diagnostics.diagnose(*diagnostics.with_experience(policy, run, first)) if request.diagnostics else None
+    found = None
+    if request.diagnostics:
+        with telling("measuring gradients and units"):
+            found = diagnostics.diagnose(*diagnostics.with_experience(policy, run, first))
     trained = policy.env
     policy, tasks, named = with_tasks(policy, vary, request.drawn)
     if vary:
@@ -180,8 +188,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
     tasks = policy.env.tasks("all") if tasks is None else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
-    print(f"playing {request.episodes * len(tasks.id)} episodes", flush=True)
-    scores = score(policy, Episodes(request.episodes, policy.trial, request.sampled), request.seed, tasks)
+    with telling(f"playing {request.episodes * len(tasks.id)} episodes", at_once=True):
+        scores = score(policy, Episodes(request.episodes, policy.trial, request.sampled), request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
     if told := describe_unseen(policy.agent):
         print(f"unseen tasks: {told}")

@@ -5,7 +5,7 @@ import itertools
 import json
 import platform
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -33,8 +33,11 @@ def to_json(config: RunConfig, extra: dict[str, Any]) -> str:
     return json.dumps({**record, **extra}, indent=2) + "\n"
 
 
-def from_json(path: Path) -> RunConfig:
+def from_json(path: Path, beside: Iterable[Path] = ()) -> RunConfig:
     """Read the configuration of a run from its config.json.
+
+    Args:
+        beside: folders of other runs that are read too, so that one error asks for the user's own files of all.
 
     Raises:
         InputError: there is no such file, or it does not describe a run.
@@ -47,7 +50,7 @@ def from_json(path: Path) -> RunConfig:
     try:
         return _from_record(record)
     except InputError as error:
-        asked = _with_import(error, str(path.parent), record)
+        asked = _with_import(error, str(path.parent), record, beside)
         text = f"{str(path)!r}: {error}{_other_version(record)}" if asked is error else str(asked)
         raise InputError(text + _with_copy(path)) from None
     except Exception as error:  # whatever an edited record makes of the classes it is read into
@@ -129,14 +132,15 @@ def _imports(record: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(record.get("imports") or (word.removeprefix("--import=") for word in words))
 
 
-def _with_import(error: InputError, run: str, record: Mapping[str, Any]) -> InputError:
+def _with_import(error: InputError, run: str, record: Mapping[str, Any], beside: Iterable[Path]) -> InputError:
     """Return an error that asks for the user's own files, if a run needs some that are not imported.
 
-    They are never run because a run's record names them.
+    It also asks for those of the runs beside. They are never run because a run's record names them.
     """
-    missing = [file for file in _imports(record) if not is_imported(Path(file))]
-    if missing:
-        flags = shlex.join(f"--import={file}" for file in missing)
+    missing = lambda record: [file for file in _imports(record) if not is_imported(Path(file))]
+    if mine := missing(record):
+        others = [file for folder in beside for file in missing(read_record(folder / "config.json"))]
+        flags = shlex.join(f"--import={file}" for file in dict.fromkeys([*mine, *others]))
         return InputError(f"{run!r} uses code of your own: add {flags} (in Python: import that file first)")
     env, name = str(record.get("env")), str(record.get("agent"))
     if (env not in ENVS and not is_mixture(env)) or name not in AGENTS:

@@ -26,18 +26,19 @@ class Records:
         self.checkpoints = Path() if directory is None else directory / "checkpoints"
         self.writer = None if directory is None else checkpoint.Writer(self.checkpoints)
 
-    def resumes(self, resume: bool) -> bool:
-        """Return whether there is a checkpoint to resume from. Every process must call this.
+    def resumes(self, resume: bool) -> int:
+        """Return the iteration of the checkpoint to resume from, 0 if there is none. Every process must call this.
 
         Raises:
             InputError: there is one, and the run is not to be resumed.
         """
-        known = bool(hosts.largest(int(self.directory is not None and checkpoint.newest(self.checkpoints) is not None)))
-        if known and not resume:
+        newest = None if self.directory is None else checkpoint.newest(self.checkpoints)
+        iteration = hosts.largest(0 if newest is None else int(newest.name))
+        if iteration and not resume:
             raise InputError(f"{str(self.directory)!r} holds a run; resume it, or choose another folder")
         if self.writes:
             checkpoint.remove_unfinished(self.checkpoints)
-        return known
+        return iteration
 
     def restore(self, shapes: TrainState) -> TrainState:
         """Return the state of the newest whole checkpoint. Damaged ones after it are renamed."""

@@ -67,6 +67,21 @@ class _Progress(NamedTuple):
     diverged: np.ndarray  # (S,) bool, the seeds that are given up
 
 
+class _Fresh(NamedTuple):
+    """Says how the state of a new run is made, before anything compiles."""
+
+    program: jax.stages.Traced
+    arguments: tuple[Any, ...]  # its training tasks, and the entries' seeds (S,) and swept values (S,)
+    shapes: TrainState
+
+
+def _trace_fresh(config: RunConfig, entries: Entries) -> _Fresh:
+    agent, mesh = config.trained, config.mesh
+    arguments = meshes.replicate(mesh, config.family.tasks("train")), *meshes.shard_by_seed(mesh, entries.axis)
+    program = trace(jit_programs(mesh, agent).init, config.family, agent, config.played, *arguments)
+    return _Fresh(program, arguments, selection.begin(config, sharded_shapes(mesh, agent, program.out_info)))
+
+
 @dataclasses.dataclass(frozen=True)
 class _Run:
     """Trains by one configuration."""
@@ -102,7 +117,10 @@ class _Run:
                 self.journal.console.say("there is no checkpoint yet, so the run starts over")
             if not resumed:
                 self.journal.introduce()
-            programs, state = self.prepare(resumed)
+            fresh = _trace_fresh(self.config, self.entries)
+            if resumed * self.config.worlds >= self.config.plan.steps and (result := self._ended(fresh.shapes)):
+                return result
+            programs, state = self.prepare(fresh, bool(resumed))
             if self.hooks.start is not None and not resumed:
                 begun = adopted(self.config, self.hooks, self.config.trained, hosts.gather(state.agent))
                 state = state._replace(agent=meshes.shard_by_seed(self.config.mesh, begun))
@@ -113,18 +131,31 @@ class _Run:
             self.journal.console.say(f"compiled in {duration(compile_seconds)}")
             return self.run_chunks(programs, state, started)._replace(compile_seconds=compile_seconds)
 
-    def prepare(self, resume: bool) -> tuple[Programs, TrainState]:
+    def _ended(self, shapes: TrainState) -> Result | None:
+        """Return the result of a run that has made all its steps, for which nothing compiles; None if some is lost."""
+        records = self.journal.records
+        state = records.restore(shapes)
+        iteration = int(state.iteration)
+        steps = iteration * self.config.worlds
+        if steps < self.config.plan.steps:
+            return None
+        found = records.earlier_evaluations(steps, False, evaluations_before(self.config))
+        if not len(found.steps):
+            return None
+        self.journal.begin(steps)
+        seconds, _ = records.earlier_seconds(iteration)
+        return Result(state, found, log.Rows(), seconds, 0.0, True, self.hooks.directory)
+
+    def prepare(self, fresh: _Fresh, resume: bool) -> tuple[Programs, TrainState]:
         """Compile all programs in parallel, and make or restore the state. Evaluation may be ready later."""
         env, agent, settings = self.config.family, self.config.trained, self.config.played
-        lazy = jit_programs(self.config.mesh, agent)
-        tasks, everything = (meshes.replicate(self.config.mesh, env.tasks(split)) for split in ("train", "all"))
-        (seeds, numbers), pool = meshes.shard_by_seed(self.config.mesh, self.entries.axis), ThreadPoolExecutor(3)
-        fresh = trace(lazy.init, env, agent, settings, tasks, seeds, numbers)
-        shapes = selection.begin(self.config, sharded_shapes(self.config.mesh, agent, fresh.out_info))
+        lazy, pool = jit_programs(self.config.mesh, agent), ThreadPoolExecutor(3)
+        (tasks, seeds, _), shapes = fresh.arguments, fresh.shapes
+        everything = meshes.replicate(self.config.mesh, env.tasks("all"))
         self._describe(shapes)
         self.journal.console.say("compiling")
         kernels = pool.submit(load_kernels, env)
-        make = None if resume else pool.submit(lambda: compile_lowered(fresh.lower(), "once"))
+        make = None if resume else pool.submit(lambda: compile_lowered(fresh.program.lower(), "once"))
         chunk = trace(lazy.chunk, env, agent, settings, tasks, shapes)
         plan = self.config.plan
         episodes = Episodes(plan.eval_episodes, settings.trials, plan.eval_sampled)
@@ -138,7 +169,7 @@ class _Run:
         if kernels.result():  # else the first chunk would wait for them
             score.result()
         if make is not None:
-            return programs, selection.begin(self.config, make.result()(tasks, seeds, numbers))
+            return programs, selection.begin(self.config, make.result()(*fresh.arguments))
         state = self.journal.records.restore(shapes)
         if forgetful(env):  # returns do not count episodes whose worlds are lost
             state = state._replace(counted=state.counted & False)
