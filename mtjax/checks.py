@@ -148,12 +148,12 @@ def shown(value: Any) -> str:
 
 
 def require_episodes(episodes: Any, seed: Any, task_seed: Any, checkpoint: Any) -> None:
-    """Check the numbers of an evaluation; ``task_seed`` may be None.
+    """Check the numbers of an evaluation; ``episodes`` and ``task_seed`` may be None.
 
     Raises:
         InputError: one is no whole number, or out of its bounds.
     """
-    require_whole("episodes", episodes, 1, MOST_EPISODES)
+    require_whole("episodes", 1 if episodes is None else episodes, 1, MOST_EPISODES)
     require_whole("seed", seed, 0, _LARGEST_SEED)
     require_whole("task-seed", 0 if task_seed is None else task_seed, 0, _LARGEST_SEED)
     require_whole("checkpoint", checkpoint, 0)

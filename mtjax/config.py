@@ -404,9 +404,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
         longest = tenth if plan.rule is None else min(tenth, plan.rule.steps // config.worlds)
         training = dataclasses.replace(training, chunk_steps=min(training.chunk_steps, max(longest, experience.steps)))
     if "eval_episodes" not in given:  # whole trials
-        plan = dataclasses.replace(
-            plan, eval_episodes=math.ceil(plan.eval_episodes / training.trials) * training.trials
-        )
+        plan = dataclasses.replace(plan, eval_episodes=trials.at_least(plan.eval_episodes, training.trials))
     if "eval_every" not in given and not plan.eval_every and plan.rule is None:
         each = config.num_tasks * plan.eval_episodes * config.family.episode_length
         often = min(max(_EVALUATED * plan.steps // each, 1), 10)

@@ -33,8 +33,8 @@ class Played:
     the package, as --list of mtjax.train shows: then nothing is written, except with --video into a folder in runs/."""
     point: int = 0
     """Number of the setting in sweep.csv, if the run holds several settings of a sweep; of a member in a population."""
-    episodes: int = 10
-    """Episodes of each task and seed."""
+    episodes: int = -1
+    """Episodes of each task and seed; -1 plays ten, or as many more as whole trials take."""
     sampled: bool = False
     """Draw actions from the policy, as in training. Else they are its mean ones, or the likeliest choices."""
     seed: int = 0
@@ -74,6 +74,11 @@ class Request(Filmed, Played):
     a rollout that an agent without one plays for that."""
 
     @property
+    def asked(self) -> int | None:
+        """Return how many episodes are asked for; None for the usual ones."""
+        return None if self.episodes == -1 else self.episodes
+
+    @property
     def drawn(self) -> int | None:
         """The seed of other tasks than the run's, if any."""
         return None if self.task_seed == -1 else self.task_seed
@@ -97,7 +102,7 @@ def _parse(argv: Sequence[str]) -> tuple[Request, dict[str, str]]:
     request = parsing.parse_with_tyro(Request, argv, Request(), _PROGRAM)
     if not request.run:
         raise InputError("say which run to evaluate: --run=DIR")
-    require_episodes(request.episodes, request.seed, request.drawn, request.checkpoint)
+    require_episodes(request.asked, request.seed, request.drawn, request.checkpoint)
     if not 0 < request.video_seconds < math.inf:
         raise InputError(f"video-seconds must be greater than 0, not {request.video_seconds:g}")
     for split in request.video_splits:

@@ -404,6 +404,16 @@ def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
         require_same_run(tmp_path, found, other)
 
 
+def test_evaluations_play_whole_trials_unless_they_are_told_how_many_episodes(capsys):
+    """Three of four episodes, by default, where ten were no whole trials."""
+    assert mtjax.evaluate("grid-navi/rl2", quiet=True).returns["train"].shape == (1, 1, 12)
+    mtjax.evaluate.main(["--run=grid-navi/rl2"])
+    assert "playing 12 episodes" in capsys.readouterr().out
+    with pytest.raises(InputError, match="a trial's 4 episodes, such as 12; not 10"):
+        mtjax.evaluate.main(["--run=grid-navi/rl2", "--episodes=10", "--export=policy.npz"])
+    assert "exported" not in capsys.readouterr().out
+
+
 def test_a_run_evaluates_whole_trials():
     """Else it is refused before it is compiled."""
     message = "eval-episodes must be a multiple of a trial's 4 episodes, such as 12; not 9"

@@ -99,8 +99,13 @@ def require_whole(episodes: int, trial: int, name: str = "episodes") -> None:
         InputError: it does not.
     """
     if episodes % trial:
-        more = -(-episodes // trial) * trial
+        more = at_least(episodes, trial)
         raise InputError(f"{name} must be a multiple of a trial's {trial} episodes, such as {more}; not {episodes}")
+
+
+def at_least(episodes: int, trial: int) -> int:
+    """Return the smallest number of episodes that makes whole trials, from a number on."""
+    return -(-episodes // trial) * trial
 
 
 def describe(returns: np.ndarray, trial: int) -> str:

@@ -34,6 +34,7 @@ from mtjax.saved.result import Result
 from mtjax.saved.tables import pandas
 from mtjax.types import SPLITS, InputError, Task
 
+_EPISODES = 10  # of each task, if nothing else is asked for
 _FIRST_NUMBER = 1_000_000  # beyond the numbers of a run's own evaluations, so that the episodes are new
 GIVEN = {"train": "given"}  # the name of the split of tasks that are not the run's own
 
@@ -76,7 +77,7 @@ def evaluate(
     *,
     vary: Mapping[str, Any] | None = None,
     split: str | None = None,
-    episodes: int = 10,
+    episodes: int | None = None,
     sampled: bool = False,
     seed: int = 0,
     task_seed: int | None = None,
@@ -92,7 +93,7 @@ def evaluate(
             with all their seeds.
         vary: other values of parameters than the run's, by name: ``{"size": "0.9:1.3:5"}`` or a list.
         split: the split to play: train, interpolation or extrapolation. None plays all.
-        episodes: of each task and seed.
+        episodes: of each task and seed; None plays ten, or as many more as whole trials take.
         sampled: draw actions from the policy; else they are its mean ones, or the likeliest choices.
         seed: seed of the starting states.
         task_seed: seed of other goals than the run's, or other tasks, where they are drawn.
@@ -114,9 +115,9 @@ def evaluate(
     policy, tasks, named = with_tasks(_policy(run, point, checkpoint), vary or {}, task_seed)
     if split is not None and not len(policy.env.tasks(split).id):
         raise InputError(f"this run has no tasks of the split {split}")
-    count = episodes * len(policy.env.tasks(split or "all").id)
-    with telling(f"playing {count} episodes", quiet):
-        scores = score(policy, Episodes(episodes, policy.trial, sampled), seed, tasks, split or "all")
+    played = _played(policy, episodes, sampled)
+    with telling(f"playing {played.count * len(policy.env.tasks(split or 'all').id)} episodes", quiet):
+        scores = score(policy, played, seed, tasks, split or "all")
     found = {named.get(name, name): (name, one) for name, one in scores.items() if one.returns.size}
     metrics = list(next(iter(scores.values())).metrics)
     return Evaluation(
@@ -172,6 +173,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     run = request.run
     first = first_seed(run, request.point)
     policy = load(run, first, request.checkpoint)
+    played = _played(policy, request.asked, request.sampled)
     if request.video:
         films.require(policy.env)
     if request.export:
@@ -188,8 +190,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
     tasks = policy.env.tasks("all") if tasks is None else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
-    with telling(f"playing {request.episodes * len(tasks.id)} episodes", at_once=True):
-        scores = score(policy, Episodes(request.episodes, policy.trial, request.sampled), request.seed, tasks)
+    with telling(f"playing {played.count * len(tasks.id)} episodes", at_once=True):
+        scores = score(policy, played, request.seed, tasks)
     print(task_table(policy, scores, named), flush=True)
     if told := describe_unseen(policy.agent):
         print(f"unseen tasks: {told}")
@@ -257,6 +259,17 @@ def _entry(point: Any, points: int, seeds: int, population: str) -> int:
     return int(point) * each
 
 
+def _played(policy: Policy, episodes: int | None, sampled: bool) -> Episodes:
+    """Return how many episodes of each task are played, and how.
+
+    Raises:
+        InputError: they are no whole number of trials.
+    """
+    count = trials.at_least(_EPISODES, policy.trial) if episodes is None else episodes
+    trials.require_whole(count, policy.trial)
+    return Episodes(count, policy.trial, sampled)
+
+
 def score(
     policy: Policy, episodes: Episodes, seed: int = 0, tasks: Task | None = None, split: str = "all"
 ) -> dict[str, Scores]:
@@ -267,9 +280,8 @@ def score(
         split: the split to play alone, in the same episodes; or "all".
 
     Raises:
-        InputError: the episodes are no whole number of trials, or an environment outside of JAX has raised an error.
+        InputError: an environment outside of JAX has raised an error.
     """
-    trials.require_whole(episodes.count, episodes.trial)
     env = policy.env
     rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
     arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
