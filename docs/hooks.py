@@ -325,6 +325,7 @@ def _family_figures(name: str) -> str:
 
 
 _ON_GPU, _ON_CPU, _OF_FIFTY, _THREE_SEEDS = "h200-families", "cpu-films", "h100-metaworld/mt50-brc", "h200-returns"
+_OF_BRAX = "h200-brax"
 _FILMED = _ON_GPU, _ON_CPU, "h100-hard/films"  # runs whose policies the films show; the last one of a family
 _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_GPU: (
@@ -334,6 +335,10 @@ _ONE_SEED = {  # runs -> their title, and where their command stands
     _ON_CPU: (
         "Two CPU cores beside other programs, one seed",
         "fifty-families-for-a-few-minutes-each-on-a-shared-h200-one-seed",
+    ),
+    _OF_BRAX: (
+        "One H200 beside four other programs, one seed",
+        "braxs-families-for-three-quarters-of-a-minute-each-on-a-shared-h200-one-seed",
     ),
     "cpu-families": ("Two CPU cores, one seed", "twenty-four-families-on-two-cpu-cores-seven-minutes-one-seed"),
     "cpu-minutes": (

@@ -70,9 +70,30 @@ def test_what_lies_far_outside_is_clipped():
     np.testing.assert_allclose(jnp.diag(slopes), [1, 1, 1000], rtol=1e-4)
 
 
-def test_what_lies_beyond_reason_is_counted_at_a_thousand_deviations():
-    """Before any observation there is no reason yet."""
-    x = jnp.float32([[5e9, 5.0, -1e9], [999.0, 4.5, 0.9]])
+def count(moments, batch):
+    """Count a batch as agents do."""
+    return normalize.update(moments, normalize.bounded(moments, jnp.float32(batch)))
+
+
+def test_what_networks_cannot_tell_apart_is_counted_alike():
+    """At ten deviations, where inputs are clipped. Before any observation nothing is far."""
+    x = jnp.float32([[5e9, 5.0, -1e9], [9.9, 4.5, 0.009]])
     np.testing.assert_array_equal(normalize.bounded(normalize.init(3), x), x)
     moments = fitted(np.float32([[-1.0, 4.0, 0.0], [1.0, 6.0, 0.0]]))
-    np.testing.assert_allclose(normalize.bounded(moments, x), [[1000, 5, -1], [999, 4.5, 0.9]])
+    np.testing.assert_allclose(normalize.bounded(moments, x), [[10, 5, -0.01], [9.9, 4.5, 0.009]], rtol=1e-6)
+
+
+def test_a_world_that_flies_off_leaves_the_scale_of_others_as_it_is():
+    """Five hundred steps of it after half a million others change the deviation by 5%."""
+    moments = fitted(np.random.default_rng(0).normal(size=(500_000, 3)))
+    spoiled = count(moments, np.full((500, 3), 1e9))
+    np.testing.assert_allclose(normalize.apply(spoiled, jnp.ones(3)), normalize.apply(moments, jnp.ones(3)), rtol=0.06)
+
+
+@pytest.mark.parametrize(("before", "batches"), [(1_000, 60), (100_000, 60)])
+def test_a_number_that_begins_to_vary_late_gets_its_scale(before, batches):
+    """It was constant, so that its first values lie far off: with as many as before them it has its own deviation."""
+    moments = fitted(np.zeros((before, 3)))
+    for batch in np.random.default_rng(0).normal(size=(batches, before // 50, 3)):
+        moments = count(moments, batch)
+    np.testing.assert_allclose(normalize._std(moments), np.sqrt(batches / (batches + 50)), rtol=0.25)

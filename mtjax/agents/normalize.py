@@ -9,7 +9,6 @@ from mtjax.types import Array
 _MIN_STD = 1e-3
 LARGEST = 10.0
 """Clip normalised observations to this size, so that rare ones do not drive networks out of range."""
-_FAR = 1e3
 
 
 class Moments(NamedTuple):
@@ -41,12 +40,12 @@ def merge(moments: Moments, others: Moments) -> Moments:
 
 
 def bounded(moments: Moments, x: Array) -> Array:
-    """Bring x (..., O) to within 1,000 standard deviations of the mean, as it is to be counted; all x at first.
+    """Bring x (..., O) to where networks tell it from others, as it is to be counted: ``LARGEST`` deviations at most.
 
-    A world that is about to blow up shows numbers of any size. Counted as they are, the numbers of one such step would
-    make all others look alike for the rest of a run.
+    A world that is about to blow up shows numbers of any size. Counted as they are, those of a few steps would make all
+    others look alike for the rest of a run. The first numbers of all count as they are.
     """
-    far = jnp.where(moments.count > 0, _FAR * _std(moments), jnp.inf)
+    far = jnp.where(moments.count > 0, LARGEST * _std(moments), jnp.inf)
     return jnp.clip(x, moments.mean - far, moments.mean + far)
 
 
