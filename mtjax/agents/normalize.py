@@ -9,6 +9,7 @@ from mtjax.types import Array
 _MIN_STD = 1e-3
 LARGEST = 10.0
 """Clip normalised observations to this size, so that rare ones do not drive networks out of range."""
+_FAR = 30.0
 
 
 class Moments(NamedTuple):
@@ -40,12 +41,12 @@ def merge(moments: Moments, others: Moments) -> Moments:
 
 
 def bounded(moments: Moments, x: Array) -> Array:
-    """Bring x (..., O) to where networks tell it from others, as it is to be counted: ``LARGEST`` deviations at most.
+    """Bring x (..., O) to within 30 standard deviations of the mean, as it is to be counted; all x at first.
 
     A world that is about to blow up shows numbers of any size. Counted as they are, those of a few steps would make all
-    others look alike for the rest of a run. The first numbers of all count as they are.
+    others look alike for the rest of a run.
     """
-    far = jnp.where(moments.count > 0, LARGEST * _std(moments), jnp.inf)
+    far = jnp.where(moments.count > 0, _FAR * _std(moments), jnp.inf)
     return jnp.clip(x, moments.mean - far, moments.mean + far)
 
 
