@@ -286,6 +286,7 @@ def test_what_has_nothing_to_see_is_not_filmed():
     assert modes == [["rgb_array"], []]
 
 
+@pytest.mark.slow
 def test_a_film_of_a_world_without_a_camera_shows_all_of_it():
     """Or says what to install."""
     tasks = PENDULUM.tasks()

@@ -155,7 +155,7 @@ def test_tasks_that_want_opposite_values_conflict():
     assert found["conflict"] == pytest.approx(4 / 6)
 
 
-@pytest.mark.parametrize("value", ["c51", "hl-gauss"])
+@pytest.mark.parametrize("value", one_in(2, ["c51", "hl-gauss"]))
 def test_td_error_of_categorical_critics_is_in_units_of_reward(value):
     """|mean of the distribution - the reward| where every step is its episode's last."""
     agent = tiny("sac", hidden=(4,), value=value, num_bins=201)
@@ -272,7 +272,7 @@ def trace(agent):
     return state, gradients, seen
 
 
-@pytest.mark.parametrize("name", one_in(3, OFF_POLICY))
+@pytest.mark.parametrize("name", one_in(6, OFF_POLICY))
 def test_every_agent_has_diagnostics(name):
     """Matrices unless it is disjoint, TD errors for each task, and layers of both networks."""
     agent = tiny(name)
@@ -377,7 +377,7 @@ def test_memories_and_pictures_are_refused():
     refused(tiny("sac"), shown, "networks take vectors")
 
 
-@pytest.mark.parametrize("encoder", one_in(3, ENCODERS))
+@pytest.mark.parametrize("encoder", one_in(5, ENCODERS))
 def test_units_of_every_encoder_are_seen(encoder):
     """Layers of the right number of networks, all of ReLUs."""
     agent = tiny("xqc" if encoder == "batch-norm" else "sac", encoder=encoder, conditioning="one-hot", hidden=(16, 16))

@@ -461,7 +461,7 @@ AGENTS = {name: ("sac", {"encoder": PARTS[name][0], **PARTS[name][1], **TOLD}) f
 AGENTS |= {name: (name, {"hidden": (6,)}) for name in ("film", "moe", "moore")}
 
 
-@pytest.mark.parametrize("name", one_in(2, AGENTS))
+@pytest.mark.parametrize("name", one_in(4, AGENTS))
 def test_agents_of_these_parts_have_the_right_shapes(name):
     """Traced, under a map over seeds: an update keeps the state's shapes, also where gradients are combined."""
     base, settings = AGENTS[name]

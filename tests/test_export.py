@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import require
-from probes import FEW, Levers, family_for, pick, slow_but, tiny, with_nets
+from probes import FEW, Levers, family_for, one_in, pick, slow_but, tiny, with_nets
 
 import mtjax
 import mtjax.evaluate
@@ -54,7 +54,7 @@ CASES = {name: {} for name in agents.AGENTS if family_for(name) == "finger-spin"
 }
 
 
-@pytest.mark.parametrize("name", slow_but(CASES, "care", "multi-head", "text"))
+@pytest.mark.parametrize("name", slow_but(CASES, "care", "text"))
 def test_all_forms_act_as_the_policy(name, tmp_path):
     """On tasks that trained and on others, whose context and nearest task are found inside."""
     if name == "text":
@@ -284,7 +284,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", slow_but(WAYS, "recurrent"))
-@pytest.mark.parametrize("scores", [False, True])
+@pytest.mark.parametrize("scores", one_in(2, [False, True]))
 def test_a_memory_goes_into_the_file(way, scores, tmp_path):
     """By NumPy and by JAX: actions, and memories through the episodes of a trial, for one world and for a batch."""
     env = mtjax.make("grid-navi", size=3, steps=2, scores=scores)

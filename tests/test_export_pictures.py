@@ -150,6 +150,7 @@ def test_files_from_before_pictures_are_read(tmp_path):
     np.testing.assert_array_equal(old(np.ones(9), size=1.1), new(np.ones(9), size=1.1))
 
 
+@pytest.mark.slow
 def test_an_action_depends_on_what_is_shipped_alone():
     """Also of a policy that sees pictures."""
     policy = policy_of(tiny("drq"), COLOURED)

@@ -78,7 +78,7 @@ PARTS = {
     "famo": ("famo", {}, TRUNK),
 }
 SPECS = {"drq-pictures": SEEN, "asymmetric": BESIDE, "sac-ae-pictures": SEEN}  # what agents see, if not vectors
-QUICK = ["sac", "care", "drq-pictures"]
+QUICK = ["sac", "care"]
 EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK))
 
 

@@ -44,7 +44,7 @@ DOMAINS = (
 FURTHER = ("finger-turn-hard", "reacher-hard", "swimmer-swimmer15", "cheetah-run-looks")  # other sizes and colours
 LOOKS = {"hue": "0,100", "floor-hue": "0,80", "sky-hue": "0,-60", "light": "1,0.5", "camera-angle": "0,25"}
 MAZES = ("corridor-maze", "two-goal-maze")
-QUICK = ("cheetah-run", "corridor-maze", "finger-turn-easy")
+QUICK = ("corridor-maze", "finger-turn-easy")
 TARGETS = {  # in states that are not of play
     "finger-turn": [0.1, 0.07],
     "fish": [0.1, 0.1, 0.2],

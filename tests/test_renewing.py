@@ -79,6 +79,7 @@ def test_critics_are_renewed_each_by_its_own_units():
     assert into.shape[0] == 2 and not np.any(into[0] == into[1]) and not np.any(critic["head"]["kernel"])
 
 
+@pytest.mark.slow
 def test_continual_backprop_replaces_one_mature_unit_at_a_time():
     """With a rate of 1/16 for eight and six units: due after two and three updates; the renewed is the youngest."""
     agent, state, batch = made("continual-backprop", replacement_rate=1 / 16, maturity=0)

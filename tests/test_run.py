@@ -26,7 +26,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import train_objects, with_nets
+from probes import one_in, train_objects, with_nets
 
 import mtjax
 import mtjax.train
@@ -284,7 +284,7 @@ def test_a_seed_among_many_is_that_seed_alone(short_family, whole):
 # Stopping and going on.
 
 
-@pytest.mark.parametrize("number, chunks", [(signal.SIGINT, 3), (signal.SIGTERM, 1)])
+@pytest.mark.parametrize("number, chunks", one_in(2, [(signal.SIGINT, 3), (signal.SIGTERM, 1)]))
 def test_stopped_run_goes_on_to_the_bit(play, whole, tmp_path, number, chunks):
     """A signal ends the run after its chunk, with a checkpoint; resumed, nothing tells it from an unbroken one.
 
@@ -307,6 +307,7 @@ def test_a_signal_in_the_last_chunk_stops_what_follows_alone(play):
     assert (result.finished, result.signal) == (True, signal.SIGINT)
 
 
+@pytest.mark.slow
 def test_a_run_is_stopped_from_within(play, whole, tmp_path):
     """By True alone, as functions may return anything else; there is a checkpoint, and no signal."""
     seen = []
@@ -434,6 +435,7 @@ def test_a_full_disk_leaves_the_file_before(whole, tmp_path):
     assert_same_evaluations(load_evaluations(file), whole.evaluations)
 
 
+@pytest.mark.slow
 def test_lost_evaluations_are_told(play, tmp_path):
     """The run goes on without those before, from the first one on."""
     play(tmp_path, steps=200)

@@ -129,6 +129,7 @@ def test_a_program_is_traced_once(folder, times, monkeypatch):
     assert len(list(folder.iterdir())) == 1 and isinstance(first[0], Point)
 
 
+@pytest.mark.slow
 def test_there_is_no_cache_unless_it_is_asked_for(folder, times, monkeypatch):
     """As with MTJAX_CACHE=0, and in a notebook."""
     trace_cache.use_folder(None)

@@ -135,6 +135,7 @@ def test_statistics_are_no_other_tasks():
             assert np.abs(one[1] - two[1]).max() > 0
 
 
+@pytest.mark.slow
 def test_no_slope_reaches_the_statistics():
     """Nor does weight decay: what Adam remembers of them is zero, and they are the batches'."""
     _, state, update = started(weight_decay=0.5, critic_lr=0.1)
@@ -165,6 +166,7 @@ def test_weights_begin_and_stay_on_the_sphere(heads):
             np.testing.assert_allclose(np.linalg.norm(x, axis=-2), 1, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_action_is_that_of_the_tasks_own_running_statistics():
     """One observation makes no batch, so it is normalised by what its task has seen; unseen tasks by the nearest's."""
     made, state, update = started(conditioning="none")
