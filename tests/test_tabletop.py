@@ -231,7 +231,7 @@ def test_a_graph_goes_from_an_end_to_any_other_and_from_elsewhere_to_the_nearest
 
 
 def play(curriculum, chunks=3, reset_free=True):
-    """Chunks of 100 steps of four worlds, two episodes long: goals, and the objects' places after each."""
+    """Chunks of 100 steps of four worlds, two episodes long: goals, and places of gripper and object, after each."""
     env = mtjax.make("tabletop")
     agent, settings = configure(
         tiny("ppo"),
@@ -247,22 +247,26 @@ def play(curriculum, chunks=3, reset_free=True):
     goals = np.stack([worlds.task.goal["goal"][:, 0] for worlds in seen])  # (chunks + 1, S, E)
     for worlds, goal in zip(seen, goals, strict=True):
         np.testing.assert_allclose(worlds.obs[:, 0, :, 4:6] * 2.8, PLACES[goal.astype(int)], atol=1e-5)
-    return goals, np.stack([worlds.state.gripper[:, 0] for worlds in seen])
+    places = lambda name: np.stack([getattr(worlds.state, name)[:, 0] for worlds in seen])  # (chunks + 1, S, E, 2)
+    return goals, places("gripper"), places("object")
 
 
 @pytest.mark.slow
 def test_worlds_play_on_forward_and_backward():
     """The goal changes where an episode's time is up, and the gripper is where it was."""
-    goals, gripper = play("forward-backward")
+    goals, gripper, _ = play("forward-backward")
     assert np.all(goals[::2] < START) and np.all(goals[1::2] == START)
     assert np.all(np.linalg.norm(gripper[1:], axis=-1) > 0.15)  # no world is at its start
 
 
 @pytest.mark.slow
 def test_worlds_play_on_by_the_graph():
-    goals, gripper = play("graph")
+    """Each goal is one that follows from where gripper and object are."""
+    goals, gripper, thing = play("graph")
     assert np.all(goals[0] < START) and np.all(np.linalg.norm(gripper[1:], axis=-1) > 0.15)
-    assert len(np.unique(goals[1:])) > 1
+    for k, seed, world in np.ndindex(*goals[1:].shape):
+        at = k + 1, seed, world
+        assert int(goals[at]) in chosen("graph", task_to(goals[k, seed, world]), table(gripper[at], thing[at]))
 
 
 @dataclasses.dataclass(frozen=True)

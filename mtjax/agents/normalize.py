@@ -9,7 +9,7 @@ from mtjax.types import Array
 _MIN_STD = 1e-3
 LARGEST = 10.0
 """Clip normalised observations to this size, so that rare ones do not drive networks out of range."""
-_FAR = 30.0
+_FAR = 100.0
 
 
 class Moments(NamedTuple):
@@ -41,7 +41,7 @@ def merge(moments: Moments, others: Moments) -> Moments:
 
 
 def bounded(moments: Moments, x: Array) -> Array:
-    """Bring x (..., O) to within 30 standard deviations of the mean, as it is to be counted; all x at first.
+    """Bring x (..., O) to within 100 standard deviations of the mean, as it is to be counted; all x at first.
 
     A world that is about to blow up shows numbers of any size. Counted as they are, those of a few steps would make all
     others look alike for the rest of a run.

@@ -164,6 +164,14 @@ def evaluations_before(config: RunConfig) -> Evaluations:
     return no_evaluations(seeds, values, config.plan.eval_episodes, config.training.trials)
 
 
+def has_evaluations(directory: Path) -> bool:
+    """Return whether a run's folder has evaluations that can be read."""
+    try:
+        return len(load_evaluations(directory / "evaluations.npz").steps) > 0
+    except InputError:
+        return False
+
+
 def evaluations_of(config: RunConfig, directory: Path) -> Evaluations:
     """Read the evaluations of a run, given its configuration.
 

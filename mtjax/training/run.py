@@ -21,7 +21,7 @@ from mtjax.learning.loop import TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
 from mtjax.saved import checkpoint, lock, log
-from mtjax.saved.folder import evaluations_before
+from mtjax.saved.folder import evaluations_before, has_evaluations
 from mtjax.saved.result import Result
 from mtjax.training import allocator, distillation, finetune, memory, selection
 from mtjax.training.console import duration
@@ -137,11 +137,11 @@ class _Run:
         state = records.restore(shapes)
         iteration = int(state.iteration)
         steps = iteration * self.config.worlds
-        if steps < self.config.plan.steps:
+        folder = self.hooks.directory
+        known = hosts.largest(int(folder is not None and has_evaluations(folder)))
+        if steps < self.config.plan.steps or not known:
             return None
-        found = records.earlier_evaluations(steps, False, evaluations_before(self.config))
-        if not len(found.steps):
-            return None
+        found = records.earlier_evaluations(steps, True, evaluations_before(self.config))
         self.journal.begin(steps)
         seconds, _ = records.earlier_seconds(iteration)
         return Result(state, found, log.Rows(), seconds, 0.0, True, self.hooks.directory)
