@@ -289,12 +289,16 @@ def _picture(name: str) -> str:
     text = ""
     for file in PICTURES.glob(f"{name}.*"):
         text += f"![tasks of {name}](../pictures/families/{file.name})\n\n"
-        text += "".join(f"As {r['agent']} plays with a return of {_score(r)}.\n\n" for _, r in _filmed(name))
-        if file.suffix == ".webp" and not _filmed(name):
-            text += "".join(f"As [`{policy}`](../results/policies.md) plays.\n\n" for policy in _players(name)[:1])
-        if file.suffix == ".webp" and name in _TRIALS:
-            text += "The episodes of one trial, side by side.\n\n"
+        text += _caption(name) if file.suffix == ".webp" else ""
     return text
+
+
+def _caption(name: str) -> str:
+    """Return who plays in a family's film, and what is seen where trials have several episodes."""
+    runs = [f"As {row['agent']} plays with a return of {_score(row)}." for _, row in _filmed(name)]
+    lines = runs or [f"As [`{policy}`](../results/policies.md) plays." for policy in _players(name)[:1]]
+    lines += ["The episodes of one trial, side by side."] * (name in _TRIALS)
+    return "".join(f"{line}\n\n" for line in lines)
 
 
 def _players(name: str) -> list[str]:

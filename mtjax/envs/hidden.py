@@ -17,7 +17,7 @@ import numpy as np
 
 from mtjax.envs.choosing import Choosing
 from mtjax.envs.family import Family
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import Look, from_above
 from mtjax.envs.pixels import Mark, Pictured
 from mtjax.envs.task_table import Table
 from mtjax.types import Array, InputError, Key, Step, Task
@@ -180,7 +180,7 @@ class GridNavi(Pictured, HiddenTasks):
 
     @property
     def episode_steps(self) -> int:  # type: ignore[override]
-        """Return the steps after which an episode is cut off, each of which an action may repeat."""
+        """Return the number of steps of an episode."""
         return self.steps
 
     @property
@@ -212,9 +212,7 @@ class GridNavi(Pictured, HiddenTasks):
     @property
     def look(self) -> Look:  # type: ignore[override]
         """Return the view from above."""
-        middle = (self.size - 1) / 2
-        light = (middle, middle, 9.0)
-        return Look(camera=(middle, middle, 1.3 * self.size), tilt=0.0, light=light, diffuse=0.2, sun=True)
+        return from_above((self.size - 1) / 2, self.size)
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return the cells, the walker, and the goal, which pictures that agents observe do not show."""

@@ -50,6 +50,18 @@ class Look(NamedTuple):
     colours: tuple[tuple[str, tuple[float, ...]], ...] = ()  # of geoms that are not as the model has them
 
 
+def from_above(middle: float, cells: float, light: float = 9.0) -> Look:
+    """Return the view of a square grid from above.
+
+    Args:
+        middle: x and y of the grid's middle.
+        cells: how many cells of size 1 are seen along each side.
+        light: height of the light.
+    """
+    height = 1.3 * cells
+    return Look((middle, middle, height), tilt=0.0, light=(middle, middle, light), diffuse=0.2, sun=True)
+
+
 def dress(spec: mujoco.MjSpec, look: Look | None, plain: bool) -> None:
     """Give a model floor, sky, camera and light. What the model has of its own stays.
 

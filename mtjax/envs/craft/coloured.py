@@ -13,7 +13,7 @@ import numpy as np
 
 from mtjax.checks import require_not_negative
 from mtjax.envs.craft.grid import MOVES
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import Look, from_above
 from mtjax.envs.mtenv.tabular import DrawnTasks
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.pixels import Mark, Pictured
@@ -153,10 +153,7 @@ class ColouredMaze(Pictured, DrawnTasks):
     @property
     def look(self) -> Look:  # type: ignore[override]
         """Return the view from above."""
-        middle = (self.cells - 1) / 2
-        return Look(
-            camera=(middle, middle, 1.3 * self.cells), tilt=0.0, light=(middle, middle, 9), diffuse=0.2, sun=True
-        )
+        return from_above((self.cells - 1) / 2, self.cells)
 
     def compile_spec(self, values: Mapping[str, float] | None = None) -> mujoco.MjSpec:
         """Return a box for each square, without its colour, the mark of the last one, and the walker."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from mtjax.envs.craft.sketched import Followed, Sketched
 from mtjax.envs.family import draw_until
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import Look, from_above
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, InputError, Key, Task
 
@@ -151,14 +151,7 @@ class OnGrid(Sketched):
     @property
     def look(self) -> Look:  # type: ignore[override]
         """Return the view from above."""
-        middle = (self.cells + 1) / 2
-        return Look(
-            camera=(middle, middle, 1.3 * (self.cells + 2)),
-            tilt=0.0,
-            light=(middle, middle, 9.0),
-            diffuse=0.2,
-            sun=True,
-        )
+        return from_above((self.cells + 1) / 2, self.cells + 2)
 
     def counts_of_things(self) -> dict[int, int]:
         """Return how many things of each kind a grid has at most."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from mtjax.envs.craft.grid import MOVES, USE
 from mtjax.envs.craft.sketched import GOAL, Followed, Sketched
-from mtjax.envs.looks import Look
+from mtjax.envs.looks import Look, from_above
 from mtjax.envs.parameters import Parameter
 from mtjax.envs.pixels import Mark
 from mtjax.types import Array, Key, Task
@@ -81,13 +81,7 @@ class LightWorld(Sketched):
     num_moves: ClassVar[int] = len(MOVES) + 1
     cheap_starts: ClassVar[bool] = True
     episode_steps: ClassVar[int] = 100
-    look: ClassVar[Look | None] = Look(
-        camera=(_ROOM * _MOST_ROOMS / 2, _ROOM * _MOST_ROOMS / 2, 1.3 * (_ROOM * _MOST_ROOMS + 1)),
-        tilt=0.0,
-        light=(_ROOM * _MOST_ROOMS / 2, _ROOM * _MOST_ROOMS / 2, 20.0),
-        diffuse=0.2,
-        sun=True,
-    )
+    look: ClassVar[Look | None] = from_above(_ROOM * _MOST_ROOMS / 2, _ROOM * _MOST_ROOMS + 1, light=20.0)
 
     def facts(self) -> dict[str, np.ndarray]:
         """Return the rooms (4, 2) of each path, relative to its first one; the last is repeated."""
