@@ -276,6 +276,16 @@ def test_the_search_ranks_what_explains_before_tables(hooks):
 
 
 @needs("mkdocs")
+def test_no_line_breaks_within_a_flag(hooks):
+    """Only in code, where what is copied stays as it was."""
+    code = '<code>a --agent.lr<i>=</i>1 --no-x b--c c</code>'
+    made = hooks.on_post_page(f"<head></head>--steps {code} --steps")
+    marked = re.findall('<span class="flag">(.*?)</span>', made)
+    assert marked == ["--agent.lr", "--no-x"]
+    assert re.sub('<span class="flag">(.*?)</span>', r"\1", made).endswith(f"</head>--steps {code} --steps")
+
+
+@needs("mkdocs")
 def test_parts_of_a_page_are_called_by_their_titles(long_pages):
     nav = [{"Results": [{"Speed": "results/speed.md"}, "results/index.md"]}]
     long_pages._nest(nav, "results/speed.md", {"results/speed-2.md": long_pages._first("## [Of](a.md) `sac`, late\n")})

@@ -673,7 +673,21 @@ def test_spoiled_parameters_are_not_saved(play, tmp_path, monkeypatch):
 def test_before_the_first_checkpoint_there_is_none_to_name(tmp_path):
     """The message says so."""
     with pytest.raises(FloatingPointError, match=r"step 12 of task 0 .*; there is no checkpoint from before it"):
-        require_finite(np.array([[2, -1]]), np.array([[-1, -1]]), 10, Records(tmp_path).last)
+        require_finite(np.array([[2, -1]]), np.full((1, 2), -1), np.zeros((1, 2)), 10, Records(tmp_path).last)
+
+
+@pytest.mark.parametrize(
+    "reward, lost, hint",
+    [
+        (-1, 1, r"\. Try lower learning rates or max-gradient-norm$"),
+        (-1, 1200, r"\. 1,200 worlds of the task blew up in these steps\. Try milder values of what varies, "),
+        (5, 1200, r"\. Mend what the environment computes"),
+    ],
+)
+def test_a_run_of_worlds_that_blow_up_says_so(reward, lost, hint):
+    """One world may blow up by itself, and a reward that is not finite comes first."""
+    with pytest.raises(FloatingPointError, match=f"finite at step 15 of task 1 .*{hint}"):
+        require_finite(np.array([[-1, 5]]), np.array([[-1, reward]]), np.array([[0, lost]]), 10, lambda: "none")
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -71,7 +71,7 @@ class Watch:
         """
         broken = np.any(metrics["bad_step"] >= 0, axis=1)
         if self.entries.end_with_one or np.all(broken | diverged):
-            require_finite(metrics["bad_step"], metrics["bad_reward"], first_step, self.last)
+            require_finite(metrics["bad_step"], metrics["bad_reward"], metrics["lost"], first_step, self.last)
         return self._given_up(broken, diverged)
 
     def before_saving(self, agents: Any, iteration: int, diverged: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from mtjax.types import Array
 
 _HINT = "Try lower learning rates or max-gradient-norm"
 _HINT_REWARD = "Mend what the environment computes, such as a logarithm of 0"
+_HINT_WORLDS = "Try milder values of what varies, more solver iterations or lower learning rates"
 
 
 @contextlib.contextmanager
@@ -43,12 +44,15 @@ def stop_signals(doing: Callable[[str], None] = lambda what: None) -> Iterator[l
             signal.signal(number, handler)
 
 
-def require_finite(bad_step: np.ndarray, bad_reward: np.ndarray, first_step: int, last: Callable[[], str]) -> None:
+def require_finite(
+    bad_step: np.ndarray, bad_reward: np.ndarray, lost: np.ndarray, first_step: int, last: Callable[[], str]
+) -> None:
     """Check that all numbers of a chunk are finite.
 
     Args:
         bad_step: (S, T), the first step of the chunk with a number that is not, or -1.
         bad_reward: (S, T), the first step of the chunk with a reward that is not, or -1.
+        lost: (S, T), how many worlds blew up in the chunk.
         first_step: the steps of every environment before the chunk.
         last: returns a clause on the run's last checkpoint.
 
@@ -62,6 +66,8 @@ def require_finite(bad_step: np.ndarray, bad_reward: np.ndarray, first_step: int
     of_reward = np.argwhere(bad_reward == step)
     seed, task = (int(i) for i in of_reward[0]) if len(of_reward) else (seed, task)
     what, hint = ("the reward is not", _HINT_REWARD) if len(of_reward) else ("numbers stopped being", _HINT)
+    if not len(of_reward) and lost[seed, task] > 1:
+        hint = f"{lost[seed, task]:,.0f} worlds of the task blew up in these steps. {_HINT_WORLDS}"
     raise FloatingPointError(
         f"{what} finite at step {first_step + step} of task {task} (number {seed} of the run's seeds); {last()}. {hint}"
     )
