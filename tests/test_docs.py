@@ -278,7 +278,7 @@ def test_the_search_ranks_what_explains_before_tables(hooks):
 @needs("mkdocs")
 def test_no_line_breaks_within_a_flag(hooks):
     """Only in code, where what is copied stays as it was."""
-    code = '<code>a --agent.lr<i>=</i>1 --no-x b--c c</code>'
+    code = "<code>a --agent.lr<i>=</i>1 --no-x b--c c</code>"
     made = hooks.on_post_page(f"<head></head>--steps {code} --steps")
     marked = re.findall('<span class="flag">(.*?)</span>', made)
     assert marked == ["--agent.lr", "--no-x"]
