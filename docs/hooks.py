@@ -113,8 +113,14 @@ def _boost(place: str) -> float | None:
 
 
 def on_post_page(output: str, **_: Any) -> str:
-    """Let the page read the search's index when it is wanted."""
+    """Let the page read the search's index when it is wanted, and keep flags in its code whole."""
+    output = re.sub(r"(?s)<code\b.*?</code>", lambda code: whole_flags(code[0]), output)
     return output.replace("</head>", f"<script>{LATE.read_text(encoding='utf-8')}</script></head>", 1)
+
+
+def whole_flags(code: str) -> str:
+    """Mark each ``--name`` in the HTML of code, so that no line ends behind its hyphens. The text stays the same."""
+    return re.sub(r"(?<![\w-])--\w[\w.-]*", r'<span class="flag">\g<0></span>', code)
 
 
 def on_post_template(output_content: str, **_: Any) -> str:

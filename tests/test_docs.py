@@ -276,6 +276,17 @@ def test_the_search_ranks_what_explains_before_tables(hooks):
 
 
 @needs("mkdocs")
+def test_flags_in_code_stay_in_one_line(hooks):
+    """Inline and in blocks, where colours cut the code; what is copied stays the same, and so does other text."""
+    block = '<code>train<span class="w"> </span>--agent.burn-in<span class="o">=</span>4 a--b -- <a id="l-0--1"></a></code>'
+    page = f'<head></head>\n<p>Not --here, <code class="x">--env=hop\n--split</code></p>{block}<p>--nor</p>'
+    made = hooks.on_post_page(page).partition("</head>")[2]
+    assert re.findall('<span class="flag">(.*?)</span>', made) == ["--env", "--split", "--agent.burn-in"]
+    assert re.sub('<span class="flag">(.*?)</span>', r"\1", made) == page.partition("</head>")[2]
+    assert re.search(r"\.flag \{\s*white-space: nowrap;", (ROOT / "docs" / "wide.css").read_text())
+
+
+@needs("mkdocs")
 def test_parts_of_a_page_are_called_by_their_titles(long_pages):
     nav = [{"Results": [{"Speed": "results/speed.md"}, "results/index.md"]}]
     long_pages._nest(nav, "results/speed.md", {"results/speed-2.md": long_pages._first("## [Of](a.md) `sac`, late\n")})
