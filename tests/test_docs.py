@@ -278,7 +278,9 @@ def test_the_search_ranks_what_explains_before_tables(hooks):
 @needs("mkdocs")
 def test_flags_in_code_stay_in_one_line(hooks):
     """Inline and in blocks, where colours cut the code; what is copied stays the same, and so does other text."""
-    block = '<code>train<span class="w"> </span>--agent.burn-in<span class="o">=</span>4 a--b -- <a id="l-0--1"></a></code>'
+    block = (
+        '<code>train<span class="w"> </span>--agent.burn-in<span class="o">=</span>4 a--b -- <a id="l-0--1"></a></code>'
+    )
     page = f'<head></head>\n<p>Not --here, <code class="x">--env=hop\n--split</code></p>{block}<p>--nor</p>'
     made = hooks.on_post_page(page).partition("</head>")[2]
     assert re.findall('<span class="flag">(.*?)</span>', made) == ["--env", "--split", "--agent.burn-in"]
