@@ -42,8 +42,6 @@ LATE = Path(__file__).parent / "late_search.js"
 ADDRESSES = Path(__file__).parent / "addresses.toml"
 _CLONE = "git clone <this repository>"
 _LOG = logging.getLogger("mkdocs.plugins.mtjax")
-_CODE = re.compile(r"<code\b.*?</code>", re.DOTALL)
-_FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
 _UNSEARCHED = "{ data-search-exclude }"  # of a heading whose text is on many pages, and would drown the search
 GROUPS = {  # title -> whether a family belongs there; the first that fits
     "Brax": lambda name, module: module.endswith("envs.brax"),
@@ -115,9 +113,14 @@ def _boost(place: str) -> float | None:
 
 
 def on_post_page(output: str, **_: Any) -> str:
-    """Let the page read the search's index when it is wanted, and break no line within the name of a flag."""
-    output = _CODE.sub(lambda code: _FLAG.sub(r'<span class="flag">\g<0></span>', code[0]), output)
+    """Let the page read the search's index when it is wanted, and keep flags in its code whole."""
+    output = re.sub(r"(?s)<code\b.*?</code>", lambda code: whole_flags(code[0]), output)
     return output.replace("</head>", f"<script>{LATE.read_text(encoding='utf-8')}</script></head>", 1)
+
+
+def whole_flags(code: str) -> str:
+    """Mark each ``--name`` in the HTML of code, so that no line ends behind its hyphens. The text stays the same."""
+    return re.sub(r"(?<![\w-])--\w[\w.-]*", r'<span class="flag">\g<0></span>', code)
 
 
 def on_post_template(output_content: str, **_: Any) -> str:

@@ -276,13 +276,16 @@ def test_the_search_ranks_what_explains_before_tables(hooks):
 
 
 @needs("mkdocs")
-def test_no_line_breaks_within_a_flag(hooks):
-    """Only in code, where what is copied stays as it was."""
-    code = "<code>a --agent.lr<i>=</i>1 --no-x b--c c</code>"
-    made = hooks.on_post_page(f"<head></head>--steps {code} --steps")
-    marked = re.findall('<span class="flag">(.*?)</span>', made)
-    assert marked == ["--agent.lr", "--no-x"]
-    assert re.sub('<span class="flag">(.*?)</span>', r"\1", made).endswith(f"</head>--steps {code} --steps")
+def test_flags_in_code_stay_in_one_line(hooks):
+    """Inline and in blocks, where colours cut the code; what is copied stays the same, and so does other text."""
+    block = (
+        '<code>train<span class="w"> </span>--agent.burn-in<span class="o">=</span>4 a--b -- <a id="l-0--1"></a></code>'
+    )
+    page = f'<head></head>\n<p>Not --here, <code class="x">--env=hop\n--split</code></p>{block}<p>--nor</p>'
+    made = hooks.on_post_page(page).partition("</head>")[2]
+    assert re.findall('<span class="flag">(.*?)</span>', made) == ["--env", "--split", "--agent.burn-in"]
+    assert re.sub('<span class="flag">(.*?)</span>', r"\1", made) == page.partition("</head>")[2]
+    assert re.search(r"\.flag \{\s*white-space: nowrap;", (ROOT / "docs" / "wide.css").read_text())
 
 
 @needs("mkdocs")
