@@ -25,6 +25,7 @@ from mtjax.agents.parts.knowing import Text
 from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.learning.evaluation import Evaluations, load_evaluations, save_evaluations
+from mtjax.learning.loop import Settings
 from mtjax.saved.log import append_rows
 from mtjax.saved.records import Records
 from mtjax.training.console import Console, duration
@@ -848,6 +849,24 @@ def test_ways_of_hindsight_are_compared_in_pairs_of_seeds(script, tmp_path):
     cells = [line.strip("| ").split(" | ") for line in script("hindsight").table(tmp_path).splitlines()[2:]]
     assert [line[0] for line in cells] == ["`none`", "`uniform`", "`inverse`"]
     assert [[x.split()[0] for x in line[3:5]] for line in cells] == [["-", "-"], ["-", "-"], ["+3.0", "-"]]
+
+
+def test_curricula_have_as_many_worlds_and_are_compared_in_pairs_of_seeds(script, tmp_path):
+    """At the end and on average, with all tasks at once and with random ones; nothing beside other seeds."""
+    curricula = script("curricula")
+    arguments = SimpleNamespace(family="sailing", played=4, every=640)
+    for way in curricula.WAYS:
+        settings = Settings(**curricula.plays(arguments, way))
+        assert settings.plays.count(curricula.TASKS) * settings.num_envs == curricula.WORLDS
+    returns = np.random.default_rng(0).uniform(size=(4, 5))  # (S, V)
+    rising = returns + np.arange(5)
+    for way, found in {"all": returns, "random": rising, "hardest": rising[:2]}.items():
+        result = {"worlds": "4 x 5", "returns": found.tolist(), "last": [[1, 2], [5, 0]], "training_seconds": 7}
+        (tmp_path / f"{way}.json").write_text(json.dumps(result))
+    cells = [line.strip("| ").split(" | ") for line in curricula.table(tmp_path).splitlines()[2:]]
+    shown = [[x.split()[0] for x in (*line[3:5], *line[6:8])] for line in cells]
+    assert shown == [["-", "-4.0", "-", "-2.0"], ["+4.0", "-", "+2.0", "-"], ["-"] * 4]
+    assert [line[8] for line in cells] == ["1.0"] * 3
 
 
 def test_returns_after_few_steps_have_a_line_for_each_split(script, tmp_path):
