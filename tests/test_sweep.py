@@ -189,7 +189,8 @@ def test_a_seed_that_diverged_stays_given_up(capsys):
     """It is told once, also if later numbers are finite; the run ends when every seed has diverged at some time."""
     run = _Run(of_three_points())
     now = _Progress(None, 0, 0.0, 0.0, None, np.zeros(3, bool))
-    chunk = lambda bad: lambda state: (state, dict.fromkeys(("bad_step", "bad_reward"), np.array(bad)[:, None]))
+    seen = lambda bad: {"bad_step": bad, "bad_reward": bad, "lost": 0 * bad}
+    chunk = lambda bad: lambda state: (state, seen(np.array(bad)[:, None]))
     for bad in ([-1, 4, -1], [-1, -1, -1], [-1, 4, -1]):
         now, _ = run._play(chunk(bad), now, 0)
         assert now.diverged.tolist() == [False, True, False]
