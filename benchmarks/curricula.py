@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import parts
 import resumable
-from report import markdown, record, run_main, settings_of
+from report import difference, markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
@@ -115,11 +115,6 @@ def row(way: str, found: dict[str, dict[str, Any]]) -> list[str]:
         cells += [f"{stats.seed_interval(own):.1f}", *(difference(own, scores.get(x)) for x in ("all", "random"))]
     worst = np.array(found[way]["last"]).mean(axis=0).min()
     return [*cells, f"{worst:.1f}", f"{found[way]['training_seconds']:.0f}"]
-
-
-def difference(own: np.ndarray, other: np.ndarray | None) -> str:
-    """Return the paired difference of two ways' scores (S,), if both have finished with as many seeds."""
-    return "-" if other is None or len(own) != len(other) else f"{stats.paired_difference(own, other):+.1f}"
 
 
 if __name__ == "__main__":

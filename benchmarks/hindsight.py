@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import parts
 import resumable
-from report import markdown, record, run_main, settings_of
+from report import difference, markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
@@ -93,11 +93,6 @@ def row(way: str, result: dict[str, Any], areas: dict[str, np.ndarray]) -> list[
     against = [difference(areas[way], areas.get(other)) if other != way else "-" for other in ("none", "uniform")]
     seconds = f"{result['training_seconds']:.0f}"
     return [f"`{way}`", f"{last:.0f}", f"{stats.seed_interval(areas[way]):.0f}", *against, seconds]
-
-
-def difference(own: np.ndarray, other: np.ndarray | None) -> str:
-    """Return the paired difference of two ways' areas (S,), if both have finished with as many seeds."""
-    return "-" if other is None or len(own) != len(other) else f"{stats.paired_difference(own, other):+.1f}"
 
 
 if __name__ == "__main__":

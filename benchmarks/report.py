@@ -17,8 +17,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import mtjax
 from mtjax.names import InputError
+from mtjax.report import stats
 from mtjax.saved.log import append_rows
 
 _LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy", "mujoco", "mujoco-mjx", "warp-lang", "brax", "playground")
@@ -121,6 +124,11 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in Markdown."""
     line = lambda cells: "| " + " | ".join(cells) + " |"
     return "\n".join([line(head), "|" + "---|" * len(head), *map(line, rows)])
+
+
+def difference(own: np.ndarray, other: np.ndarray | None) -> str:
+    """Return the paired difference of two ways' scores (S,), if both have finished with as many seeds."""
+    return "-" if other is None or len(own) != len(other) else f"{stats.paired_difference(own, other):+.1f}"
 
 
 def read_lines(path: Path) -> list[dict[str, str]]:

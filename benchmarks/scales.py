@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import parts
 import resumable
-from report import markdown, record, run_main, settings_of
+from report import difference, markdown, record, run_main, settings_of
 
 from mtjax.compiling.programs import enable_compile_cache
 from mtjax.config import configure, with_preset
@@ -191,9 +191,7 @@ def lines(found: dict[str, Any], agent: str) -> Iterator[list[str]]:
 
 def compared(own: np.ndarray, alone: np.ndarray | None) -> list[str]:
     """Return the cells of scores (S,), and of what they have less than the control's, if it has as many seeds."""
-    known = alone is not None and len(alone) == len(own)
-    against = f"{stats.paired_difference(own, alone):+.1f}" if known else "-"  # type: ignore
-    return [f"{stats.seed_interval(own):.1f}", against]
+    return [f"{stats.seed_interval(own):.1f}", difference(own, alone)]
 
 
 def scores_of(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
