@@ -37,7 +37,7 @@ from mtjax.learning.evaluation import Episodes, adapted, evaluate
 from mtjax.report import stats
 from mtjax.saved.result import Result
 
-_FAMILY = {"num_tasks": 20, "split": "dense"}
+FAMILIES = {"point-mass-vary-goal": {"num_tasks": 20, "split": "dense"}}  # others have their own tasks and split
 _MAML = {"num_envs": 10, "unroll": 100, "gamma": 0.97, "conditioning": "none"}
 _TINY = 1e-6  # of an inner step that does not move a policy
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -68,7 +68,7 @@ def measure(arguments: argparse.Namespace, way: str) -> None:
     """Learn the tasks, or go on with the run that was stopped, and write what is earned after every update."""
     enable_compile_cache()
     learner, given = WAYS[way]
-    plain = with_preset(arguments.env, learner, **_FAMILY)
+    plain = with_preset(arguments.env, learner, **FAMILIES.get(arguments.env, {}))
     if learner == "maml":
         given = {"inner_rate": arguments.inner_rate, **given}
     else:
@@ -102,7 +102,7 @@ def after_updates(arguments: argparse.Namespace, result: Result) -> dict[str, An
     env: Any = result.env
     agent: Any = dataclasses.replace(result.agent, inner_rate=arguments.inner_rate)  # type: ignore
     seeds, found = jnp.arange(arguments.seeds, dtype=jnp.uint32), {}
-    for split in ("train", "interpolation", "extrapolation"):
+    for split in splits_of(result):
         tasks = env.tasks(split)
         ask = lambda count, tasks=tasks: adapted(
             env, agent, arguments.adapt_envs, count, result.state.agent, tasks, seeds, jnp.int32(0)
@@ -116,8 +116,13 @@ def after_updates(arguments: argparse.Namespace, result: Result) -> dict[str, An
 def by_episode(arguments: argparse.Namespace, result: Result) -> dict[str, Any]:
     """Return the returns (S, K + 1) of each split in the episodes of trials, in the last evaluation."""
     of_trial = lambda x: x[:, -1].reshape(*x.shape[:1], x.shape[2], -1, arguments.updates + 1).mean(axis=(1, 2))
-    returns = result.evaluations.returns
-    return {split: np.round(np.float64(of_trial(x)), 3).tolist() for split, x in returns.items() if x.shape[2]}
+    earned = {split: of_trial(result.evaluations.returns[split]) for split in splits_of(result)}
+    return {split: np.round(np.float64(x), 3).tolist() for split, x in earned.items()}
+
+
+def splits_of(result: Result) -> list[str]:
+    """Return the splits that have tasks."""
+    return [split for split, x in result.evaluations.returns.items() if x.shape[2]]
 
 
 def table(out: Path) -> str:
