@@ -65,6 +65,8 @@ def on_config(config: Any) -> Any:
     missing = [name for name, address in known.items() if not address]
     if missing:
         _LOG.info("%s lacks %s", ADDRESSES.name, ", ".join(missing))
+    for difference in differences(known):
+        _LOG.warning(difference)
     config.repo_url = known["repository"] or None
     config.site_url = known["site"] or config.site_url
     for entry in config.nav:
@@ -132,6 +134,24 @@ def on_post_template(output_content: str, **_: Any) -> str:
 def addresses() -> dict[str, str]:
     """Return the addresses that only the owner of a published copy knows, by name; empty where there is none."""
     return tomllib.loads(ADDRESSES.read_text(encoding="utf-8"))
+
+
+def differences(known: dict[str, str]) -> list[str]:
+    """Return how the files that are read without the site differ from the owner's addresses, a sentence for each."""
+    citation = dict(re.findall(r'(?m)^([\w-]+): "?([^"\n]+)', (ROOT / "CITATION.cff").read_text(encoding="utf-8")))
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"].get("urls", {})
+    places = (
+        ("CITATION.cff", "repository-code", citation, known["repository"]),
+        ("CITATION.cff", "url", citation, known["site"]),
+        ("CITATION.cff", "doi", citation, known["doi"].removeprefix("https://doi.org/")),
+        ("pyproject.toml", "Repository", urls, known["repository"]),
+        ("pyproject.toml", "Documentation", urls, known["site"]),
+    )
+    return [
+        f"{file}: {key} is {there.get(key, '')!r}, and {ADDRESSES.name} has {address!r}"
+        for file, key, there, address in places
+        if there.get(key, "") != address
+    ]
 
 
 def llms(config: Any, files: Files) -> str:

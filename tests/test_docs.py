@@ -371,6 +371,21 @@ def test_addresses_stand_in_one_file(hooks, monkeypatch):
 
 
 @needs("mkdocs")
+def test_citation_and_package_have_the_same_addresses(hooks, monkeypatch, tmp_path):
+    """What differs is told, line by line; a DOI stands in a citation without its host."""
+    assert hooks.differences(hooks.addresses()) == []
+    known = {"repository": "https://host/me/mtjax", "site": "", "doi": "https://doi.org/10.1/2"}
+    (tmp_path / "CITATION.cff").write_text('title: "mtjax"\nrepository-code: "https://host/you/mtjax"\ndoi: 10.1/2\n')
+    (tmp_path / "pyproject.toml").write_text('[project]\nurls = { Documentation = "https://me.host/mtjax/" }\n')
+    monkeypatch.setattr(hooks, "ROOT", tmp_path)
+    assert hooks.differences(known) == [
+        "CITATION.cff: repository-code is 'https://host/you/mtjax', and addresses.toml has 'https://host/me/mtjax'",
+        "pyproject.toml: Repository is '', and addresses.toml has 'https://host/me/mtjax'",
+        "pyproject.toml: Documentation is 'https://me.host/mtjax/', and addresses.toml has ''",
+    ]
+
+
+@needs("mkdocs")
 def test_raw_files_are_linked_where_a_page_names_them():
     """A file to its copy; a folder or a pattern to the list, whose titles have such anchors."""
     raw, anchors = made_of("raw_files"), made_of("long_pages").anchors
