@@ -143,11 +143,17 @@ def test_what_lasts_says_how_far_it_is(monkeypatch):
     for now[0], done in ((107.0, 0.0), (117.0, 0.01), (307.0, 0.5), (507.0, 1.0)):
         share.reach(done)
         said.append(str(share))
+        now[0] += 5
+        said.append(str(share))
     assert said == [
         "playing: 7.0 s",
+        "playing: 12 s",
         "playing: 1% done  17 s, 16 min 30 s left",
+        "playing: 1% done  22 s, 16 min 25 s left",
         "playing: 50% done  3 min 27 s, 3 min 20 s left",
+        "playing: 50% done  3 min 32 s, 3 min 15 s left",
         "playing: 100% done  6 min 47 s, 0.0 s left",
+        "playing: 100% done  6 min 52 s, 0.0 s left",
     ]
 
 

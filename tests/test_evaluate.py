@@ -563,6 +563,7 @@ def test_evaluate_says_how_far_it_is(copied_run, capsys, monkeypatch):
 
     def play(policy, episodes, seed, tasks, *, tell):
         tell(0.0)
+        time.sleep(0.01)
         tell(0.25)
         time.sleep(0.1)
         return {split: Scores(np.ones((2, len(x), 1)), {}) for split, x in VALUES.items()}

@@ -99,7 +99,8 @@ def evaluate(
         point: number of the setting, if the run holds several settings of a sweep; of a population, of the member,
             which plays alone.
         checkpoint: iteration of the checkpoint, if ``run`` is a folder; 0 takes the newest.
-        quiet: print nothing. Else a line says what is played, if that takes longer than two seconds.
+        quiet: print nothing. Else what is played, how much of it is done and the time that is left are told, if it
+            takes longer than two seconds.
 
     Raises:
         InputError: there is no such run, or an argument cannot be used.
@@ -292,7 +293,7 @@ def score(
     Raises:
         InputError: an environment outside of JAX has raised an error.
     """
-    env = policy.env
+    env: Any = policy.env
     rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
     arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
     arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))

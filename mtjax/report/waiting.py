@@ -15,11 +15,12 @@ class _Share:
 
     def __init__(self, what: str):
         self.what, self.begun, self.done = what, time.monotonic(), 0.0
-        self.since = self.begun  # when its first part began
+        self.since = self.reached = self.begun  # when its first part began, and when the last one ended
 
     def reach(self, done: float) -> None:
         """Note the share that is done, which is 0 where its first part begins."""
-        self.since, self.done = self.since if done else time.monotonic(), done
+        self.reached = time.monotonic()
+        self.since, self.done = self.since if done else self.reached, done
 
     def __str__(self) -> str:
         """Return what is under way, its seconds, and once a share is done that and the seconds that are left."""
@@ -27,7 +28,8 @@ class _Share:
         taken = duration(now - self.begun)
         if not done:
             return f"{self.what}: {taken}"
-        return f"{self.what}: {done:.0%} done  {taken}, {duration((now - self.since) * (1 - done) / done)} left"
+        left = (self.reached - self.since) / done - (now - self.since)
+        return f"{self.what}: {done:.0%} done  {taken}, {duration(max(left, 0.0))} left"
 
 
 @contextlib.contextmanager
