@@ -26,9 +26,10 @@ from mtjax.envs import BENCHMARKS
 from mtjax.envs.metaworld.names import TASKS
 from mtjax.learning.evaluation import Evaluations, load_evaluations, save_evaluations
 from mtjax.learning.loop import Settings
+from mtjax.progress import duration
 from mtjax.saved.log import append_rows
 from mtjax.saved.records import Records
-from mtjax.training.console import Console, duration
+from mtjax.training.console import Console
 from mtjax.types import InputError
 
 _OF_META_WORLD = ("physics", "steps_per_second", "metaworld_policies")

@@ -2,6 +2,7 @@
 
 import io
 import re
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -124,14 +125,73 @@ def test_evaluations_name_splits_and_worst_tasks(capsys):
 def test_what_lasts_is_told_again(monkeypatch, capsys, at_once):
     """Until it ends, whatever its end; at once if that was asked for."""
     monkeypatch.setattr(waiting, "_SOON", 0.01)
-    monkeypatch.setattr(waiting, "_OFTEN", 0.01)
     with pytest.raises(InputError), waiting.telling("playing", at_once=at_once):
         time.sleep(0.1)
         raise InputError("ended")
     first, *lines = capsys.readouterr().out.splitlines()
-    assert first == ("playing" if at_once else "playing: 0 s") and {*lines} == {"playing: 0 s"}
+    assert first == ("playing" if at_once else "playing: 0.0 s")
+    assert len(lines) > 1 and all(re.fullmatch(r"playing: 0\.\d s", line) for line in lines)
     time.sleep(0.03)
     assert capsys.readouterr() == ("", "")
+
+
+def test_what_lasts_says_how_far_it_is(monkeypatch):
+    """The time that is left is by the share that is done, from where its first part began."""
+    now = [100.0]
+    monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    share, said = waiting._Share("playing"), []
+    for now[0], done in ((107.0, 0.0), (117.0, 0.01), (307.0, 0.5), (507.0, 1.0)):
+        share.reach(done)
+        said.append(str(share))
+        now[0] += 5
+        said.append(str(share))
+    assert said == [
+        "playing: 7.0 s",
+        "playing: 12 s",
+        "playing: 1% done  17 s, 16 min 30 s left",
+        "playing: 1% done  22 s, 16 min 25 s left",
+        "playing: 50% done  3 min 27 s, 3 min 20 s left",
+        "playing: 50% done  3 min 32 s, 3 min 15 s left",
+        "playing: 100% done  6 min 47 s, 0.0 s left",
+        "playing: 100% done  6 min 52 s, 0.0 s left",
+    ]
+
+
+def test_lines_on_what_lasts_come_ever_more_rarely(monkeypatch, capsys):
+    """At last one every fifteen seconds: a file of half an hour holds some hundred and twenty."""
+    now, waits = [0.0], []
+
+    class Ended:
+        def wait(self, seconds):
+            waits.append(seconds)
+            now[0] += seconds
+            return now[0] > 1800
+
+        def set(self):
+            pass
+
+    monkeypatch.setattr(waiting, "threading", SimpleNamespace(Event=Ended, Thread=threading.Thread))
+    monkeypatch.setattr(waiting, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with waiting.telling("playing"):
+        pass
+    assert waits[:5] == [2, 2, 4, 8, 15] and set(waits[5:]) == {15}
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:3] == ["playing: 2.0 s", "playing: 4.0 s", "playing: 8.0 s"] and 115 < len(lines) < 125
+
+
+def test_what_lasts_is_a_bar_on_a_terminal(monkeypatch):
+    """It ends with what was done at last, and leaves the terminal as it was."""
+    terminal = Terminal(monkeypatch, 160)
+    monkeypatch.setattr(waiting, "_SOON", 0.01)
+    monkeypatch.setattr(waiting, "_OFTEN", 0.01)
+    with waiting.telling("playing [all]") as tell:
+        for done in (0.0, 0.25, 1.0):
+            tell(done)
+            time.sleep(0.1)
+    text = terminal.getvalue()
+    assert "playing [all]: 25% done  0." in text and "━" in text and text.count("\n") == 1
+    assert text.rfind("100% done") > text.rfind("25% done")
+    assert text.count("\x1b[?25l") == text.count("\x1b[?25h") == 1
 
 
 def test_playing_for_a_film_is_told(monkeypatch, capsys):
@@ -146,7 +206,7 @@ def test_playing_for_a_film_is_told(monkeypatch, capsys):
     policy, tasks = SimpleNamespace(env=None), SimpleNamespace(id=[0, 1])
     with pytest.raises(InputError, match="enough"):
         films.write(policy, tasks, [], 1.0, 0, Path("film"), {})  # type: ignore
-    assert capsys.readouterr().out == "playing 2 tasks for the film: 0 s\n"
+    assert capsys.readouterr().out.startswith("playing 2 tasks for the film: 0.0 s\n")
 
 
 def test_quiet_console_is_quiet(capsys):

@@ -24,7 +24,7 @@ from probes import quick, slow_but
 
 from mtjax import envs
 from mtjax.envs.engines import base as physics
-from mtjax.envs.engines import host, shared
+from mtjax.envs.engines import c, host, shared
 from mtjax.envs.engines.base import World
 from mtjax.envs.engines.c import MujocoC
 from mtjax.envs.engines.mjx import Mjx
@@ -257,10 +257,13 @@ def test_a_process_may_end_while_its_worlds_still_step():
     subprocess.run([sys.executable, "-c", ENDS_EARLY], env=environment(), check=True, timeout=120)
 
 
-def test_c_results_do_not_depend_on_what_the_batch_did_before():
-    """After a start, a question of contact, other worlds or other tasks, a step is that of a fresh engine."""
-    play = played("finger-spin")
-    env = family("finger-spin", engine="c")
+@pytest.mark.parametrize(("name", "sensors"), [("finger-spin", True), ("walker-walk", False)])
+def test_c_results_do_not_depend_on_what_the_batch_did_before(name, sensors):
+    """After a start, a question of contact, other worlds or other tasks, a step is that of a fresh engine.
+
+    Worlds keep their own data where these serve sensors. Else all share a thread's, which fit into a cache.
+    """
+    play, env = played(name), family(name, engine="c")
     tasks, world, action, _ = play
     used, mapped = MujocoC(env.models, env.num_substeps), jax.vmap
     turned = jax.tree.map(lambda x: x[::-1], (tasks, world, action))
@@ -280,6 +283,8 @@ def test_c_results_do_not_depend_on_what_the_batch_did_before():
     for i in np.random.RandomState(0).randint(len(calls), size=30):
         fresh = MujocoC(env.models, env.num_substeps)
         jax.tree.map(np.testing.assert_array_equal, calls[i](used), calls[i](fresh))
+    held = [worlds for (of, _), (worlds, _) in c._batches.items() if of is c._known[used._digest]]
+    assert held and all(worlds.persistent == sensors for worlds in held)
 
 
 def test_extra_is_carried_along():

@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import signal
+import time
 import types
 
 import jax
@@ -25,7 +26,7 @@ import mtjax.train
 from mtjax.checks import amount
 from mtjax.learning import evaluation, loop
 from mtjax.learning.evaluation import Episodes, Evaluations, Scores, evaluate, load_evaluations, record
-from mtjax.report import films, render, scoring
+from mtjax.report import films, render, scoring, waiting
 from mtjax.report.tables import split_table, task_table
 from mtjax.saved import checkpoint
 from mtjax.saved.config_json import from_json
@@ -180,6 +181,26 @@ def test_nothing_is_played_long_after_all_episodes_have_ended(monkeypatch, early
     step = lambda carry, time: ((carry[0] + 1, carry[1] & (time < 5)), None)
     count, _ = evaluation._play(step, (jnp.int32(0), jnp.ones(2, bool)), length, early)
     assert count == played
+
+
+@pytest.mark.parametrize("parts", [1, 3, 100])
+@pytest.mark.parametrize("episodes", [Episodes(3), Episodes(6, 3), Episodes(3, sampled=True)])
+def test_an_evaluation_in_parts_is_one_as_a_whole(monkeypatch, parts, episodes):
+    """Bit by bit, and it tells before each part how far it is; where all trials have ended it stops."""
+    tasks = tasks_of("one-step", (1.0, -0.5, 2.0))._replace(horizon=jnp.int32([5, 4, 2]))
+    monkeypatch.setattr(evaluation, "_PARTS", parts)
+    monkeypatch.setattr(Fatal, "tasks", lambda self, split: tasks)
+    evaluation.play_on.clear_cache()
+    env, agent, seeds, shares = Fatal(), Doubtful() if episodes.sampled else Leaning(), jnp.asarray([3, 8]), []
+    policy = types.SimpleNamespace(env=env, agent=agent, states=jnp.float32([[0.3], [1.7]]), seeds=seeds)
+    found = scoring.score(policy, episodes, 2, tasks, "train", shares.append)["train"]  # type: ignore
+    whole = evaluate(env, agent, episodes, policy.states, tasks, seeds, jnp.int32(scoring._FIRST_NUMBER + 2))
+    jax.tree.map(np.testing.assert_array_equal, found, whole)
+
+    length = env.episode_length * episodes.trial
+    longest = found.metrics["steps"].reshape(2, 3, -1, episodes.trial).sum(axis=-1).max()
+    times = np.arange(0, longest, -(-length // parts))
+    assert shares == [*times / length, 1.0] and longest < length
 
 
 @dataclasses.dataclass(frozen=True)
@@ -537,6 +558,24 @@ def test_success_is_told_beside_returns():
     assert "success" not in task_table(types.SimpleNamespace(env=env, trial=1), scores)  # type: ignore
 
 
+def test_evaluate_says_how_far_it_is(copied_run, capsys, monkeypatch):
+    """Where that takes longer than two seconds, before the table."""
+
+    def play(policy, episodes, seed, tasks, *, tell):
+        tell(0.0)
+        time.sleep(0.01)
+        tell(0.25)
+        time.sleep(0.1)
+        return {split: Scores(np.ones((2, len(x), 1)), {}) for split, x in VALUES.items()}
+
+    monkeypatch.setattr(scoring, "score", play)
+    monkeypatch.setattr(waiting, "_SOON", 0.01)
+    mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1"])
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first == "playing 14 episodes"  # seven tasks and two seeds
+    assert re.fullmatch(r"playing 14 episodes: 25% done  0\.\d s, 0\.\d s left", second)
+
+
 def test_scores_are_printed_where_they_cannot_be_written(copied_run, capsys, monkeypatch):
     """As in the run of a colleague."""
 
@@ -545,7 +584,7 @@ def test_scores_are_printed_where_they_cannot_be_written(copied_run, capsys, mon
 
     monkeypatch.setattr(scoring, "_new_folder", refuse)
     scores = {split: Scores(np.ones((2, len(x), 1)), {}) for split, x in VALUES.items()}
-    monkeypatch.setattr(scoring, "score", lambda *_: scores)
+    monkeypatch.setattr(scoring, "score", lambda *_, tell: scores)
     with pytest.raises(PermissionError):
         mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1"])
     assert "train" in capsys.readouterr().out

@@ -29,6 +29,7 @@ GROUND = (
     "types",
     "names",
     "checks",
+    "progress",
     "tasks",
     "frames",
     "parallel",

@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import inspect
 import pydoc
+import re
 import subprocess
 import sys
 import time
@@ -210,7 +211,10 @@ def test_wrong_arguments_are_refused_before_anything_is_compiled(result, monkeyp
 def test_an_evaluation_that_takes_long_says_what_it_plays(result, monkeypatch, capsys, quiet):
     """Unless it is to be quiet; a short one says nothing."""
 
-    def score(policy, episodes, seed, tasks, split):
+    def score(policy, episodes, seed, tasks, split, tell):
+        tell(0.0)
+        time.sleep(0.01)
+        tell(0.25)
         time.sleep(0.1)
         return {split: Scores(np.ones((2, len(policy.env.tasks(split).id), episodes.count)), {})}
 
@@ -219,7 +223,9 @@ def test_an_evaluation_that_takes_long_says_what_it_plays(result, monkeypatch, c
     assert capsys.readouterr().out == ""
     monkeypatch.setattr(waiting, "_SOON", 0.01)
     mtjax.evaluate(result, split="train", episodes=3, quiet=quiet)
-    assert capsys.readouterr().out == "playing 6 episodes: 0 s\n" * (not quiet)
+    lines = capsys.readouterr().out.splitlines()
+    assert all(re.fullmatch(r"playing 12 episodes: 25% done  0\.\d s, 0\.\d s left", line) for line in lines)
+    assert bool(lines) != quiet
 
 
 @pytest.mark.parametrize("run", [None, 3, "nowhere", ShortFinger()])

@@ -38,13 +38,14 @@ from mtjax.learning import loop
 from mtjax.learning.evaluation import load_evaluations, save_evaluations
 from mtjax.learning.loop import Settings
 from mtjax.names import Notice
+from mtjax.progress import duration
 from mtjax.report import read_runs
 from mtjax.saved import checkpoint, log
 from mtjax.saved.config_json import from_json
 from mtjax.saved.folder import evaluations_of, new_directory
 from mtjax.saved.records import Records
 from mtjax.training import entries, journal, run
-from mtjax.training.console import Clock, duration
+from mtjax.training.console import Clock
 from mtjax.training.journal import Journal
 from mtjax.training.stops import require_finite, stop_signals
 from mtjax.types import SPLITS, InputError

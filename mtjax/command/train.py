@@ -14,6 +14,7 @@ from mtjax.config import RunConfig
 from mtjax.learning import populations
 from mtjax.learning.evaluation import as_one_seed
 from mtjax.parallel import hosts
+from mtjax.progress import duration
 from mtjax.report.curve import draw
 from mtjax.report.tables import split_table
 from mtjax.saved import checkpoint, lock
@@ -21,7 +22,6 @@ from mtjax.saved.config_json import describe_stop, import_flags, write_config
 from mtjax.saved.folder import new_directory, record_steps, resumed_config, short_name
 from mtjax.saved.result import Result
 from mtjax.training import memory
-from mtjax.training.console import duration
 from mtjax.training.journal import Hooks
 from mtjax.training.launch import check, launch, load_start
 from mtjax.types import InputError

@@ -11,7 +11,7 @@ from jax.sharding import Mesh, NamedSharding
 
 from mtjax.compiling import trace_cache
 from mtjax.envs.mixtures import FamilyOrMixture
-from mtjax.learning.evaluation import evaluate
+from mtjax.learning.evaluation import begin, evaluate, play_on
 from mtjax.learning.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
 from mtjax.types import Agent
@@ -74,7 +74,13 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
     )
 
 
-_DONATED = {init: (), run_chunk: (1,), evaluate: ()}  # the functions that are kept, and what they donate
+_DONATED = {
+    init: (),
+    run_chunk: (1,),
+    evaluate: (),
+    begin: (),
+    play_on: (),
+}  # the functions that are kept, and what they donate
 
 
 def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:

@@ -25,6 +25,7 @@ from mtjax.tasks import draw_at
 from mtjax.types import SPLITS, Adapting, Agent, Array, Env, InputError, Key, Task, Transition
 
 _ASKED = 100  # steps between two times of asking whether all episodes have ended
+_PARTS = 100  # of an evaluation, at most, if the host plays it part by part
 _EVER = "success_ever"  # the metric that success was 1 at any step of an episode
 
 
@@ -187,34 +188,91 @@ def evaluate(
         number: () number of the evaluation in the run; each has fresh keys, independent of training.
         places: (T,) of ``tasks`` among all tasks of ``env``, whose episodes they then play; None: they are all tasks.
     """
+    keys, begun = begin(env, agent, episodes, state, tasks, seeds, number, places)
+    step = partial(_step, env, agent, episodes, state, tasks, keys)
+    return by_episode(_play(step, begun, _length(env, episodes), env.ends_early).scores)
 
+
+class Playing(NamedTuple):
+    """Holds trials that are being played."""
+
+    worlds: Worlds
+    scores: Scores  # (S, T, trials, episodes of a trial)
+    alive: Array  # (S, T, trials) bool, whether they go on
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def begin(
+    env: Env,
+    agent: Agent,
+    episodes: Episodes,
+    state: Any,
+    tasks: Task,
+    seeds: Array,
+    number: Array,
+    places: Array | None = None,
+) -> tuple[Key, Playing]:
+    """Begin the trials of ``evaluate``; return their keys (S, T, trials) and what ``play_on`` goes on with."""
     trials = of_episodes(episodes.trial)
     shape = (len(seeds), len(tasks.id), episodes.count // episodes.trial)  # of trials
     fresh = lambda seed: jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 0x7E57), number)
     drawn = shape[1:] if places is None else (len(env.tasks("all").id), shape[2])
     keys = jax.vmap(lambda seed: jax.random.split(fresh(seed), drawn))(seeds)
     keys = keys if places is None else keys[:, places]
-
-    def step(carry, time: Array):
-        before, scores, alive = carry
-        drawn = _drawing(keys, time) if episodes.sampled else None
-        worlds, env_step = step_envs(env, agent, state, tasks, before, drawn, trials=trials)
-        worlds = _go_on(env, agent, state, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
-        now = alive[..., None] & _is_now(before, trials.episodes)
-        # Rewards after an episode's end may not be finite.
-        returns = scores.returns + jnp.where(now, env_step.transition.reward[..., None], 0.0)
-        metrics = _latest(env_step.metrics, scores.metrics, now & ~env_step.lost[..., None])
-        return (worlds, Scores(returns, metrics), alive & ~env_step.transition.closed), None
-
     worlds = reset_envs(env, agent, state, tasks, keys, trials, lambda _: draw_in_turn(tasks, keys))
     take = lambda worlds: step_envs(env, agent, state, tasks, worlds, None, trials=trials)[1]
     env_step = jax.eval_shape(take, worlds)
     metrics = {name: jnp.zeros((*shape, trials.episodes), x.dtype) for name, x in env_step.metrics.items()}
     metrics |= {_EVER: metrics["success"]} if "success" in metrics else {}
     nothing = Scores(jnp.zeros((*shape, trials.episodes)), metrics)
-    begun, length = (worlds, nothing, jnp.ones(shape, bool)), env.episode_length * trials.episodes
-    scores = _play(step, begun, length, env.ends_early)[1]
-    return jax.tree.map(lambda x: x.reshape(*shape[:2], episodes.count), scores)
+    return keys, Playing(worlds, nothing, jnp.ones(shape, bool))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def play_on(
+    env: Env, agent: Agent, episodes: Episodes, state: Any, tasks: Task, keys: Key, playing: Playing, first: Array
+) -> Playing:
+    """Play a part of the steps of ``evaluate``, from the time ``first`` (), which is one of ``parts``."""
+    step = partial(_step, env, agent, episodes, state, tasks, keys)
+    return jax.lax.scan(step, playing, first + jnp.arange(parts(env, episodes).step))[0]
+
+
+def parts(env: Env, episodes: Episodes) -> range:
+    """Return the times at which the parts of an evaluation begin; its end is where the last trial ends."""
+    length = _length(env, episodes)
+    return range(0, length, -(-length // _PARTS))
+
+
+def by_episode(scores: Scores) -> Scores:
+    """Return the scores of trials, leaves (S, T, trials, episodes of a trial), by episode (S, T, episodes)."""
+    return jax.tree.map(lambda x: x.reshape(*x.shape[:2], x.shape[2] * x.shape[3]), scores)
+
+
+def _length(env: Env, episodes: Episodes) -> int:
+    """Return the most steps of a trial."""
+    return env.episode_length * episodes.trial
+
+
+def _step(
+    env: Env,
+    agent: Agent,
+    episodes: Episodes,
+    state: Any,
+    tasks: Task,
+    keys: Key,
+    playing: Playing,
+    time: Array,
+) -> tuple[Playing, None]:
+    """Play the step of all trials at a time (), for a scan. It changes no scores of trials that have ended."""
+    (before, scores, alive), trials = playing, of_episodes(episodes.trial)
+    drawn = _drawing(keys, time) if episodes.sampled else None
+    worlds, env_step = step_envs(env, agent, state, tasks, before, drawn, trials=trials)
+    worlds = _go_on(env, agent, state, tasks, worlds, env_step, alive, partial(_at, keys, time), trials)
+    now = alive[..., None] & _is_now(before, trials.episodes)
+    # Rewards after an episode's end may not be finite.
+    returns = scores.returns + jnp.where(now, env_step.transition.reward[..., None], 0.0)
+    metrics = _latest(env_step.metrics, scores.metrics, now & ~env_step.lost[..., None])
+    return Playing(worlds, Scores(returns, metrics), alive & ~env_step.transition.closed), None
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))

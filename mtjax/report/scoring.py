@@ -3,11 +3,10 @@
 import contextlib
 import dataclasses
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -100,7 +99,8 @@ def evaluate(
         point: number of the setting, if the run holds several settings of a sweep; of a population, of the member,
             which plays alone.
         checkpoint: iteration of the checkpoint, if ``run`` is a folder; 0 takes the newest.
-        quiet: print nothing. Else a line says what is played, if that takes longer than two seconds.
+        quiet: print nothing. Else what is played, how much of it is done and the time that is left are told, if it
+            takes longer than two seconds.
 
     Raises:
         InputError: there is no such run, or an argument cannot be used.
@@ -116,8 +116,8 @@ def evaluate(
     if split is not None and not len(policy.env.tasks(split).id):
         raise InputError(f"this run has no tasks of the split {split}")
     played = _played(policy, episodes, sampled)
-    with telling(f"playing {played.count * len(policy.env.tasks(split or 'all').id)} episodes", quiet):
-        scores = score(policy, played, seed, tasks, split or "all")
+    with telling(_playing(policy, played, split or "all"), quiet) as tell:
+        scores = score(policy, played, seed, tasks, split or "all", tell)
     found = {named.get(name, name): (name, one) for name, one in scores.items() if one.returns.size}
     metrics = list(next(iter(scores.values())).metrics)
     return Evaluation(
@@ -190,8 +190,8 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
         print(f"tasks and goals are drawn by the seed {request.task_seed}")
     tasks = policy.env.tasks("all") if tasks is None else tasks
     chosen = films.choose(policy.env, request.video_splits, request.video_tasks) if request.video else ()
-    with telling(f"playing {played.count * len(tasks.id)} episodes", at_once=True):
-        scores = score(policy, played, request.seed, tasks)
+    with telling(_playing(policy, played), at_once=True) as tell:
+        scores = score(policy, played, request.seed, tasks, tell=tell)
     print(task_table(policy, scores, named), flush=True)
     if told := describe_unseen(policy.agent):
         print(f"unseen tasks: {told}")
@@ -270,25 +270,47 @@ def _played(policy: Policy, episodes: int | None, sampled: bool) -> Episodes:
     return Episodes(count, policy.trial, sampled)
 
 
+def _playing(policy: Policy, episodes: Episodes, split: str = "all") -> str:
+    """Return the words that say how many episodes of a split are played."""
+    return f"playing {episodes.count * len(policy.env.tasks(split).id) * len(policy.seeds):,} episodes"
+
+
 def score(
-    policy: Policy, episodes: Episodes, seed: int = 0, tasks: Task | None = None, split: str = "all"
+    policy: Policy,
+    episodes: Episodes,
+    seed: int = 0,
+    tasks: Task | None = None,
+    split: str = "all",
+    tell: Callable[[float], None] = lambda share: None,
 ) -> dict[str, Scores]:
     """Return the scores (S, T, episodes) of each split, in whole trials of episodes that no training run has seen.
 
     Args:
         tasks: all tasks of the policy's environment, if they are numbered anew.
         split: the split to play alone, in the same episodes; or "all".
+        tell: a function to call with the share of the steps that is done, before each part of them.
 
     Raises:
         InputError: an environment outside of JAX has raised an error.
     """
-    env = policy.env
+    env: Any = policy.env
     rows = {name: np.asarray(env.tasks(name).id) for name in (SPLITS if split == "all" else [split])}
     arguments = policy.states, env.tasks(split) if tasks is None else tasks, policy.seeds
     arguments += (jnp.int32(_FIRST_NUMBER + seed), *([] if split == "all" else [jnp.asarray(rows[split])]))
-    program = trace(evaluation.evaluate, env, judged(policy.agent), episodes, *arguments)
+    fixed, learned = (env, judged(policy.agent), episodes), arguments[:2]
+    program = trace(evaluation.begin, *fixed, *arguments)
+    following = trace(evaluation.play_on, *fixed, *learned, *program.out_info, jnp.int32(0))
+    begin, play_on = (compile_lowered(traced.lower(), "seldom") for traced in (program, following))
     with host.explaining():
-        found = jax.block_until_ready(compile_lowered(program.lower(), "seldom")(*arguments))
+        keys, playing = begin(*arguments)
+        times = evaluation.parts(env, episodes)
+        for first in times:
+            tell(first / times.stop)
+            playing = play_on(*learned, keys, playing, jnp.int32(first))
+            if not np.any(playing.alive):
+                break
+        tell(1.0)
+    found = evaluation.by_episode(playing.scores)
     return {split: found} if split in rows else {name: of_tasks(found, places) for name, places in rows.items()}
 
 

@@ -1,16 +1,16 @@
-"""Progress of a run: a bar on a terminal, plain lines elsewhere."""
+"""Progress of a run: its steps, the time that is left, returns and evaluations."""
 
 import math
-import sys
 from collections.abc import Mapping
 
 import numpy as np
 
 from mtjax.checks import amount
 from mtjax.learning import trials
+from mtjax.progress import LONGEST, Display, duration
 
 _SHARE = 1 / 3  # of a run under random actions from which a warning is due
-_LINES, _SECONDS = 50, 15.0  # plain lines in a run, and the longest time without one
+_LINES = 50  # plain lines in a run
 
 
 class Clock:
@@ -47,32 +47,13 @@ class Clock:
         return f"{duration(seconds)} left" if known else f"at least {duration(seconds)} left" if seconds else ""
 
 
-class Console:
-    """Progress display: a bar on a terminal, plain lines elsewhere, nothing if ``quiet``."""
+class Console(Display):
+    """Shows the progress of a run."""
 
     def __init__(self, total_steps: int, quiet: bool = False, label: str = "", clock: Clock | None = None):
-        self.total, self.quiet, self.bar = total_steps, quiet, None
+        super().__init__(total_steps, quiet)
         self.label, self.clock = f"{label}  " if label else "", clock or Clock(0, 0)
         self.evaluated, self.shown = "", (0, -math.inf)  # steps and seconds of the last line
-        if quiet or not sys.stdout.isatty():
-            return
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        self.bar = Progress(BarColumn(8), TextColumn("{task.description}"), transient=False)
-        self.task = self.bar.add_task("compiling", total=total_steps)
-        self.bar.start()
-
-    def say(self, text: str) -> None:
-        """Print a line."""
-        if self.bar is not None:
-            self.bar.console.print(text, highlight=False, markup=False, soft_wrap=True)
-        elif not self.quiet:
-            print(text, flush=True)
-
-    def doing(self, what: str) -> None:
-        """Show on the bar what takes time now."""
-        if self.bar is not None:
-            self.bar.update(self.task, description=what)
 
     def progress(self, steps: int, seconds: float, rate: float, returns: np.ndarray, running: str = "") -> None:
         """Show steps, rate, time left and returns.
@@ -89,7 +70,7 @@ class Console:
         told = describe_returns(returns) or running or "no episode has ended"
         if self.bar is not None:  # whose end a narrow terminal cuts off, so that what matters most comes first
             text = f"{self.label}{told}  {left}  {steps:,} of {self.total:,}  {rate:,.0f} steps/s{self.evaluated}"
-            self.bar.update(self.task, completed=steps, description=text)
+            self.doing(text, steps)
         elif self._is_due(steps, seconds):
             self.shown, when = (steps, seconds), f"{duration(seconds)}{', ' * bool(left)}{left}"
             self.say(f"{self.label}{steps:,} of {self.total:,} steps  {when}  {rate:,.0f} steps/s  {told}")
@@ -97,7 +78,7 @@ class Console:
     def _is_due(self, steps: int, seconds: float) -> bool:
         """Return whether a plain line is due: the first, the last, and after a share of the run or some seconds."""
         before, then = self.shown
-        return steps - before >= self.total / _LINES or seconds - then >= _SECONDS or steps >= self.total
+        return steps - before >= self.total / _LINES or seconds - then >= LONGEST or steps >= self.total
 
     def evaluation(
         self,
@@ -121,11 +102,6 @@ class Console:
         self.say(f"{self.label}evaluation at {steps:,} steps: {told}")
         means = ", ".join(f"{split} {amount(x.mean())}" for split, x in returns.items() if x.size)
         self.evaluated = f"  evaluated {means}"
-
-    def close(self) -> None:
-        """Stop the bar."""
-        if self.bar is not None:
-            self.bar.stop()
 
 
 def describe_returns(returns: np.ndarray) -> str:
@@ -188,13 +164,3 @@ def _of_trial(returns: np.ndarray, trial: int) -> str:
 def _share(success: np.ndarray | None) -> str:
     known = np.zeros(0) if success is None else success[np.isfinite(success)]
     return f", success {known.mean():.2f}" if known.size else ""
-
-
-def duration(seconds: float) -> str:
-    """Return seconds as text: 41 s, 3 min 5 s, 2 h 4 min."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"

@@ -20,11 +20,11 @@ from mtjax.learning.evaluation import Episodes, Evaluations
 from mtjax.learning.loop import TrainState
 from mtjax.parallel import hosts
 from mtjax.parallel import mesh as meshes
+from mtjax.progress import duration
 from mtjax.saved import checkpoint, lock, log
 from mtjax.saved.folder import evaluations_before, has_evaluations
 from mtjax.saved.result import Result
 from mtjax.training import allocator, distillation, finetune, memory, selection
-from mtjax.training.console import duration
 from mtjax.training.entries import Entries, Watch
 from mtjax.training.host_replay import Exchange
 from mtjax.training.journal import NO_HOOKS, Hooks, Journal

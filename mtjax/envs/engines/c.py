@@ -24,8 +24,7 @@ _MOST_BATCHES = 64  # kept of all engines (mt50 steps 32); those that were not u
 class MujocoC:
     """MuJoCo's C engine for CPUs: a pure function on the host that programs call by name, threaded over worlds.
 
-    The host flattens every mapped axis into one batch with one model per world, picked by ``task.row``. A batch keeps
-    its computed data, and continues from there if it receives the very state that it returned last.
+    The host flattens every mapped axis into one batch with one model per world, picked by ``task.row``.
     """
 
     models: Sequence[mujoco.MjModel]
@@ -126,7 +125,7 @@ class _Worlds:
         """Return the batch for these worlds. Its models are set only when they change."""
         worlds, known = _batches.pop((self, len(rows)), (None, None))
         if worlds is None:
-            worlds = batch.Batch(self.models[0], len(rows), persistent=True)
+            worlds = batch.Batch(self.models[0], len(rows), persistent=_keeps_data(self.models[0]))
         if known is None or not np.array_equal(known, rows):
             worlds.set_models([self.models[i] for i in rows])
         with _LOCK:
@@ -147,6 +146,16 @@ def _without_reset(models: Sequence[mujoco.MjModel]) -> list[mujoco.MjModel]:
     for model in copies.values():
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return [copies[id(model)] for model in models]
+
+
+def _keeps_data(model: mujoco.MjModel) -> bool:
+    """Return whether each world keeps its own computed data, and continues from there if its state is the same.
+
+    That pays where sensors need those data before the next step. Else the data of a thread serve all worlds: those of
+    a thousand fit into no cache. MuJoCo asks for it where bodies sleep, and for its IPC.
+    """
+    asks = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_IPC
+    return bool(model.nsensor or model.opt.enableflags & asks)
 
 
 def _state(worlds: Any, size: int) -> np.ndarray:
