@@ -74,13 +74,8 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
     )
 
 
-_DONATED = {
-    init: (),
-    run_chunk: (1,),
-    evaluate: (),
-    begin: (),
-    play_on: (),
-}  # the functions that are kept, and what they donate
+# The functions that are kept, and what they donate.
+_DONATED = {init: (), run_chunk: (1,), evaluate: (), begin: (), play_on: ()}
 
 
 def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:
