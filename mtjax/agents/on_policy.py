@@ -55,7 +55,7 @@ class Batch(NamedTuple):
     followed: None = None  # as a rollout keeps what followed every step
 
 
-def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
+def losses_of(agent: "OnPolicy", state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
     """Return the losses of actor and critic on windows (T, B, L, ...) of a rollout that the agent has assessed."""
     state, batch = agent.prepare(state, window, tasks)
     error = jnp.mean(jnp.abs(critics.Units.of(state).rewards(batch.target) - batch.value), axis=1)
@@ -68,7 +68,7 @@ def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, ke
     return Losses(state.nets, {"critic": (above_least(agent, critic_loss), (batch, error)), "actor": actor}, batch)
 
 
-def actors_loss(agent: Any, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+def actors_loss(agent: "OnPolicy", nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
     """Return the loss of one task in the actor's step, where ``knowing`` may learn from the critic's loss too."""
     loss, aux = agent.actor_loss(nets, batch, key)
     if not (agent.conditioning.by_actor and nets["knowing"].parts):
@@ -76,7 +76,7 @@ def actors_loss(agent: Any, nets: Nets, batch: Batch, key: Key) -> tuple[Array, 
     return loss + CRITICS_WEIGHT * agent.critic_loss(nets, batch)[0], aux
 
 
-def with_models(agent: Any, state: AgentState, batch: Batch, key: Key) -> Batch:
+def with_models(agent: "OnPolicy", state: AgentState, batch: Batch, key: Key) -> Batch:
     """Return a batch (T, B, ...) with targets of the representation's models, if it learns."""
     if not agent.representation.learns:
         return batch

@@ -316,7 +316,7 @@ class Options(OnPolicy):
         return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **flat.extras._asdict())
 
 
-def chooser(agent: Any) -> Network:
+def chooser(agent: Options) -> Network:
     """Return the network of the policy over options."""
     return network_of(agent, "actor")
 
@@ -336,18 +336,18 @@ def arrival(values: Values, option: Array, ends: Array, cost: float | Array) -> 
     return (1 - ends) * at_option(values.options, option) + ends * (values.state - cost)
 
 
-def of_option(agent: Any, net: Any, seen: Array, option: Array) -> Array:
+def of_option(agent: Options, net: Any, seen: Array, option: Array) -> Array:
     """Return the outputs (..., P) of sub-policies or of terminations for inputs (..., O); 0 for no option."""
     return agent.actor.apply(net, jnp.zeros(0), with_due(seen, option, agent.num_options))
 
 
-def for_actions(agent: Any, nets: Nets, seen: Array, option: Array) -> Array:
+def for_actions(agent: Options, nets: Nets, seen: Array, option: Array) -> Array:
     """Return those outputs (..., P) of sub-policies for inputs (..., O) that the policy reads: all but STOP."""
     outputs = of_option(agent, nets["actor"], seen, option)
     return outputs[..., :-1] if agent.endings == "stop" else outputs
 
 
-def ends_of(agent: Any, nets: Nets, seen: Array, option: Array, mask: Array | None) -> Array:
+def ends_of(agent: Options, nets: Nets, seen: Array, option: Array, mask: Array | None) -> Array:
     """Return the probabilities (...) with which options (...) end for inputs (..., O); any number for no option."""
     if agent.endings == "learned":
         return jax.nn.sigmoid(of_option(agent, nets["termination"], seen, option)[..., 0])
@@ -355,19 +355,19 @@ def ends_of(agent: Any, nets: Nets, seen: Array, option: Array, mask: Array | No
     return jax.nn.sigmoid(outputs[..., -1] - jax.nn.logsumexp(allowed(outputs[..., :-1], mask), axis=-1))
 
 
-def known_of(agent: Any, state: AgentState, features: Array, obs: Any) -> Values:
+def known_of(agent: Options, state: AgentState, features: Array, obs: Any) -> Values:
     """Return the values of observations (T, B, ...) in units of reward."""
     q = critics.values(agent, state, features, obs)
     over = over_tasks(partial(choices, agent), state.nets, features, obs)
     return Values(q, jnp.sum(jax.nn.softmax(over) * q, axis=-1))
 
 
-def choices(agent: Any, nets: Nets, features: Array, obs: Any) -> Array:
+def choices(agent: Options, nets: Nets, features: Array, obs: Any) -> Array:
     """Return the logits (B, K) of the policy over options."""
     return chooser(agent).apply(nets["over_options"], *agent.view.actor_inputs(nets, features, obs))
 
 
-def ending(agent: Any, nets: Nets, features: Array, obs: Any, option: Array, mask: Array | None = None) -> Array:
+def ending(agent: Options, nets: Nets, features: Array, obs: Any, option: Array, mask: Array | None = None) -> Array:
     """Return the probabilities (B,) with which options (B,) end; any number for no option."""
     _, seen = agent.view.actor_inputs(nets, features, obs)
     return ends_of(agent, nets, seen, option, mask)
