@@ -249,14 +249,14 @@ class Options(OnPolicy):
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
-        taken, of_tasks = flat.extras, partial(known_of, self, state)
+        taken, of_tasks = flat.extras, partial(values_of, self, state)
         here, then = of_tasks(features, obs), of_tasks(features, next_obs)
         there = features, next_obs, taken.now.option, tasks.action_mask
         ends = over_tasks(partial(ending, self), state.nets, *there)
         upon = arrival(then, taken.now.option, ends, self.deliberation_cost)
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
-        of_option, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
-        known = of_option, upon, reward, here.state, at_option(here.options, taken.before)
+        of_chosen, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
+        known = of_chosen, upon, reward, here.state, at_option(here.options, taken.before)
         value, next_value, reward, of_state, of_before = map(in_order, known)
         advantage = clipped_ratio.gae(self, tasks, steps._replace(reward=reward), value, next_value)
         target = value + advantage
@@ -288,7 +288,7 @@ class Options(OnPolicy):
         gain, metrics = clipped_ratio.gain(self, log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
 
-        logs = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs))
+        logs = jax.nn.log_softmax(option_logits(self, nets, batch.features, batch.obs))
         option_ratio = limited(at_option(logs, option) - taken.option_log_prob)
         choice, _ = clipped_ratio.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
@@ -355,14 +355,14 @@ def ends_of(agent: Options, nets: Nets, seen: Array, option: Array, mask: Array 
     return jax.nn.sigmoid(outputs[..., -1] - jax.nn.logsumexp(allowed(outputs[..., :-1], mask), axis=-1))
 
 
-def known_of(agent: Options, state: AgentState, features: Array, obs: Any) -> Values:
+def values_of(agent: Options, state: AgentState, features: Array, obs: Any) -> Values:
     """Return the values of observations (T, B, ...) in units of reward."""
     q = critics.values(agent, state, features, obs)
-    over = over_tasks(partial(choices, agent), state.nets, features, obs)
+    over = over_tasks(partial(option_logits, agent), state.nets, features, obs)
     return Values(q, jnp.sum(jax.nn.softmax(over) * q, axis=-1))
 
 
-def choices(agent: Options, nets: Nets, features: Array, obs: Any) -> Array:
+def option_logits(agent: Options, nets: Nets, features: Array, obs: Any) -> Array:
     """Return the logits (B, K) of the policy over options."""
     return chooser(agent).apply(nets["over_options"], *agent.view.actor_inputs(nets, features, obs))
 
