@@ -30,7 +30,7 @@ from mtjax.learning import combinations, populations, trials
 from mtjax.learning.loop import Settings
 from mtjax.names import PRESETS, nearest_error, public
 from mtjax.parallel import mesh as meshes
-from mtjax.types import InputError
+from mtjax.types import Agent, Env, InputError
 
 TUNED_TASKS = 10
 """How many tasks a preset was tuned with if its file does not say so."""
@@ -416,7 +416,7 @@ def fit_length(config: RunConfig, given: Collection[str]) -> RunConfig:
     return dataclasses.replace(config, plan=plan, training=training, learner=learner)
 
 
-def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple[Any, Settings]:
+def configure(agent: Agent, settings: Settings, given: Mapping[str, Any]) -> tuple[Any, Settings]:
     """Return the agent and the loop's settings with the given values in place of their own.
 
     Raises:
@@ -428,7 +428,7 @@ def configure(agent: Any, settings: Settings, given: Mapping[str, Any]) -> tuple
     return replace(agent, rest), dataclasses.replace(settings, **loop_values)
 
 
-def _with_policy(agent: Any, env: Any) -> Any:
+def _with_policy(agent: Agent, env: Env) -> Any:
     """Return the agent with the policy for an environment's actions.
 
     A policy of a family's continuous ones needs no size, which may take a compiled model.
@@ -452,7 +452,7 @@ def describe_teacher(agent: BaseAgent, tasks: int, context: int, runs: int) -> d
     return {"agent": agent_name_of(agent), "settings": plain, **sizes}
 
 
-def _with_teacher(learner: Any, record: Mapping[str, Any] | None, env: Any) -> Any:
+def _with_teacher(learner: Any, record: Mapping[str, Any] | None, env: Env) -> Any:
     """Return the agent with the teacher that a record describes, if there is one."""
     if record is None:
         return learner

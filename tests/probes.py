@@ -20,7 +20,7 @@ from mtjax.agents.parts.continual import Continual
 from mtjax.agents.parts.knowing import last_steps
 from mtjax.agents.parts.plasticity import Plasticity
 from mtjax.agents.parts.policies import Gaussian
-from mtjax.command.keywords import configured
+from mtjax.command.keywords import from_keywords
 from mtjax.config import Plan, configure
 from mtjax.envs import ENVS, Family, Parameter
 from mtjax.envs.choosing import Acting
@@ -307,7 +307,7 @@ def train_objects(env, agent, **given):
     plan = {name: given.pop(name) for name in Plan.__dataclass_fields__ if name in given}
     written = ("settings", "sweep", "profile", "tensorboard", "wandb", "trackio")
     more = {name: given.pop(name) for name in written if name in given}
-    config = configured(env, agent, given, plan=plan, start=hooks.start, **more)
+    config = from_keywords(env, agent, given, plan=plan, start=hooks.start, **more)
     check(config, hooks.start)
     return launch(config, hooks)
 

@@ -163,7 +163,7 @@ def test_a_configuration_is_checked_where_it_is_made(words, given, said, monkeyp
     plan = {name: given.pop(name) for name in ("eval_episodes", "population") if name in given}
     agent = given.pop("agent", "sac")
     with pytest.raises(InputError, match=said):
-        keywords.configured("point-mass-vary-goal", agent, given, plan=plan)
+        keywords.from_keywords("point-mass-vary-goal", agent, given, plan=plan)
     run_config.parse(["--env=point-mass-vary-goal", "--agent=sac"])
 
 
@@ -184,7 +184,7 @@ _REDO = {"encoder": "identity", "unit_head": False, "plasticity": "redo"}
 )
 def test_a_command_and_keywords_make_one_configuration(agent, given):
     """Settings are checked together with those of which the agent's own default is refused."""
-    made = keywords.configured("cartpole-swingup-vary-pole-mass", agent, given, plan={"steps": 3000})
+    made = keywords.from_keywords("cartpole-swingup-vary-pole-mass", agent, given, plan={"steps": 3000})
     words = [word for name, value in given.items() for word in _as_words(made, name, value)]
     said = run_config.parse(["--env=cartpole-swingup-vary-pole-mass", f"--agent={agent}", "--steps=3000", *words])
     assert said == made
@@ -201,7 +201,8 @@ def _as_words(config, name, value):
 
 def test_evaluations_that_are_given_stay():
     """Though they are the usual ones; else a short run has fewer, of whole trials."""
-    plan_of = lambda given, **plan: keywords.configured("finger-spin", "sac", given, plan={"steps": 9000} | plan).plan
+    make = lambda given, **plan: keywords.from_keywords("finger-spin", "sac", given, plan={"steps": 9000} | plan)
+    plan_of = lambda given, **plan: make(given, **plan).plan
     assert plan_of({"trials": 3}).eval_episodes == 12
     assert plan_of({}).eval_every == 4500
     assert plan_of({}, eval_every=0).eval_every == 0
@@ -209,33 +210,33 @@ def test_evaluations_that_are_given_stay():
 
 def test_names_bring_the_tuned_settings_and_objects_their_own(monkeypatch):
     """What is given by keyword changes them."""
-    configured = lambda *words, **given: keywords.configured(*words, given, plan={})
-    assert configured("finger-spin-vary-size", "care") == with_preset("finger-spin-vary-size", "care")
+    make = lambda *words, **given: keywords.from_keywords(*words, given, plan={})
+    assert make("finger-spin-vary-size", "care") == with_preset("finger-spin-vary-size", "care")
     env = mtjax.make("finger-spin-vary-size")
-    tuned = configured(env, "care", num_envs=3, num_experts=2)
+    tuned = make(env, "care", num_envs=3, num_experts=2)
     assert tuned.training.num_envs == 3 and tuned.learner.encoder.num_experts == 2
     assert tuned.learner.actor_lr == with_preset("finger-spin-vary-size", "care").learner.actor_lr
     assert tuned.plan == Plan() and tuned.family is env
-    plain = configured("finger-spin", mtjax.agent("sac-conditioned"), vary={"size": "1:1.1:3"}, encoder="film")
+    plain = make("finger-spin", mtjax.agent("sac-conditioned"), vary={"size": "1:1.1:3"}, encoder="film")
     assert plain.training == Settings() and plain.family.train_count == 3
     assert agents.settings(plain.learner)["encoder"] == "film"
 
 
 def test_a_presets_worlds_are_of_the_tasks_that_keywords_play():
     """Whether the curriculum is given by name or inside of settings; what else is given there stays."""
-    configured = lambda **given: keywords.configured("finger-spin", "sac", {"vary": {"size": "0.9:1.1:200"}}, **given)
-    given = {"vary": {"size": "0.9:1.1:200"}, "curriculum": "random:10:4000"}
-    named = keywords.configured("finger-spin", "sac", given, plan={})
+    vary = {"vary": {"size": "0.9:1.1:200"}}
+    make = lambda given=vary, **more: keywords.from_keywords("finger-spin", "sac", given, plan={}, **more)
+    named = make(vary | {"curriculum": "random:10:4000"})
     assert (named.training.num_envs, named.learner.experience.batch_size) == (16, 32)
     assert named.training.curriculum == "random:10:4000"
-    inside = configured(plan={}, settings=Settings(num_envs=3, curriculum="random:10:4000"))
+    inside = make(settings=Settings(num_envs=3, curriculum="random:10:4000"))
     assert (inside.training.num_envs, inside.learner.experience.batch_size) == (3, 32)
-    of_all = configured(plan={})
+    of_all = make()
     assert (of_all.training.num_envs, of_all.learner.experience.batch_size) == (1, 4)
     with pytest.raises(InputError, match="plays 1 to 200 of the 200 training tasks at a time, not 201"):
-        keywords.configured("finger-spin", "sac", given | {"curriculum": "random:201:4000"}, plan={})
+        make(vary | {"curriculum": "random:201:4000"})
     with pytest.raises(InputError, match="curriculum"):
-        keywords.configured("finger-spin", "sac", given | {"curriculum": 4}, plan={})
+        make(vary | {"curriculum": 4})
 
 
 def test_an_object_that_lacks_what_is_called_is_refused(monkeypatch):

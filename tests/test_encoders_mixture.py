@@ -12,7 +12,7 @@ from mtjax.agents.networks import Network, Params
 from mtjax.agents.parts.encoders import ENCODERS
 from mtjax.agents.parts.encoders.mixture import Experts, top_k_softmax
 from mtjax.agents.parts.encoders.moore import orthonormal
-from mtjax.command.keywords import configured
+from mtjax.command.keywords import from_keywords
 from mtjax.envs.probes import Probe
 from mtjax.training.launch import check
 from mtjax.types import InputError, Spec
@@ -264,7 +264,7 @@ def test_tables_of_tasks_must_fit_the_tasks(settings, message, monkeypatch):
     with pytest.raises(InputError, match=message):
         jax.eval_shape(lambda: made.init(env.spec, env.tasks(), jax.random.key(0)))
     with pytest.raises(InputError, match=message):
-        check(configured(env, made, {}, plan={}))
+        check(from_keywords(env, made, {}, plan={}))
 
 
 REFUSED = [

@@ -13,7 +13,7 @@ import mtjax
 from mtjax.agents import agent, clipped_ratio, for_action
 from mtjax.agents.maml import MAML
 from mtjax.agents.parts.policies import Taken
-from mtjax.command.keywords import configured
+from mtjax.command.keywords import from_keywords
 from mtjax.envs.probes import Probe, World, tasks_of
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Episodes, adapted, evaluate
@@ -172,7 +172,7 @@ def test_what_does_not_adapt_is_refused(settings, message):
 
 def test_devices_that_would_share_a_seeds_worlds_are_refused_before_a_run(monkeypatch):
     mesh = SimpleNamespace(shape={"seeds": 2, "envs": 1}, size=2)
-    config = configured(Walk(), tiny("maml"), {}, plan={})
+    config = from_keywords(Walk(), tiny("maml"), {}, plan={})
     monkeypatch.setattr(meshes, "mesh_for", lambda *_: mesh)
     check(config.checked())
     mesh.shape = {"seeds": 1, "envs": 2}

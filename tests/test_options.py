@@ -13,7 +13,7 @@ from test_sketches import Corridor
 import mtjax
 from mtjax.agents import critics, for_action
 from mtjax.agents.fit import learned
-from mtjax.agents.options import NONE, Batch, Running, Taken, choices, ending, for_actions
+from mtjax.agents.options import NONE, Batch, Running, Taken, ending, for_actions, option_logits
 from mtjax.agents.state import of_task
 from mtjax.envs.probes import Probe
 from mtjax.experience.rollouts import windows
@@ -66,7 +66,7 @@ def tables(agent, nets):
     number = lambda o: jnp.full(STATES, o)
     outputs = [for_actions(agent, nets, EYE, number(o)) for o in range(OPTIONS)]
     ends = [ending(agent, nets, features, EYE, number(o)) for o in range(OPTIONS)]
-    over = jax.nn.softmax(choices(agent, nets, features, EYE))
+    over = jax.nn.softmax(option_logits(agent, nets, features, EYE))
     return jax.nn.softmax(jnp.stack(outputs, axis=1)), jnp.stack(ends, axis=1), over
 
 
@@ -193,7 +193,9 @@ def test_targets_are_those_of_a_plain_loop(how):
     for i in (0, 1):
         nets, features = of_task(state.nets, i), TASKS.context[i]
         q_of = lambda x, nets=nets, z=features: np.asarray(agent.output(nets, z, x), np.float64)
-        over_of = lambda x, nets=nets, z=features: np.asarray(jax.nn.softmax(choices(agent, nets, z, x)), np.float64)
+        over_of = lambda x, nets=nets, z=features: np.asarray(
+            jax.nn.softmax(option_logits(agent, nets, z, x)), np.float64
+        )
         q, next_q, over, next_over = q_of(steps.obs[i]), q_of(steps.next_obs[i]), over_of(steps.obs[i]), None
         next_over, option = over_of(steps.next_obs[i]), np.asarray(steps.extras.now.option[i])
         ends = np.asarray(ending(agent, nets, features, steps.next_obs[i], steps.extras.now.option[i]))

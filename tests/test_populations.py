@@ -13,7 +13,7 @@ from probes import Walk, tiny
 import mtjax
 from mtjax.agents import swept
 from mtjax.command import sweep
-from mtjax.command.keywords import configured
+from mtjax.command.keywords import from_keywords
 from mtjax.compiling.programs import Programs
 from mtjax.config import configure
 from mtjax.learning import loop, populations
@@ -133,7 +133,8 @@ def test_other_rules_are_refused(text):
 
 
 def of_population(rule, agent=None, sweep=(), **plan):
-    return configured(Walk(), agent or tiny("sac"), SMALL, plan={"steps": 400, "population": rule, **plan}, sweep=sweep)
+    plan = {"steps": 400, "population": rule, **plan}
+    return from_keywords(Walk(), agent or tiny("sac"), SMALL, plan=plan, sweep=sweep)
 
 
 @pytest.mark.parametrize(

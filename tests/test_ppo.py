@@ -502,37 +502,39 @@ def allowed(row):
         return False
 
 
-def pairs(**choices):
-    """Settings in which every two choices of different kinds meet at least once, but for those that are refused."""
-    whole = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
+def all_allowed(**choices):
+    """Every combination of choices that is not refused; all other settings are the usual ones."""
+    rows = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
+    return [row for row in rows if allowed(row)]
+
+
+def pairs(*groups):
+    """Settings in which every two choices of different kinds meet at least once.
+
+    Each of ``groups`` lists settings of some kinds, and any of one group go with any of the others.
+    """
+    whole = [{name: x for part in parts for name, x in part.items()} for parts in itertools.product(*groups)]
     np.random.default_rng(0).shuffle(whole)
     numbers = {}  # of every two choices
     number = lambda pair: numbers.setdefault(pair, len(numbers))
     found = np.array([[number(pair) for pair in itertools.combinations(row.items(), 2)] for row in whole])
-    rows, missing, refused = [], np.ones(len(numbers), bool), set()
-    for fewest in range(found.shape[1], 0, -1):
-        start = 0
-        while len(left := start + np.flatnonzero(missing[found[start:]].sum(axis=1) >= fewest)):
-            i = next((i for i in left if i not in refused and allowed(whole[i])), None)
-            refused.update(left if i is None else left[left < i])
-            if i is None:
-                break
-            rows.append(whole[i])
-            missing[found[i]], start = False, i + 1
+    rows, missing = [], np.ones(len(numbers), bool)
+    while missing.any():
+        i = np.argmax(missing[found].sum(axis=1))
+        rows.append(whole[i])
+        missing[found[i]] = False
     return rows
 
 
 COMBINED = pairs(
-    conditioning=CONDITIONINGS,
-    encoder=list(ENCODERS),
-    heads=["shared", "per-task", "disjoint"],
-    gradients=list(RULES),
-    value_normalization=["running", "popart"],
-    gradient_scope=["shared", "per-layer"],
+    all_allowed(conditioning=CONDITIONINGS, encoder=ENCODERS),
+    all_allowed(heads=["shared", "per-task", "disjoint"], gradients=RULES, gradient_scope=["shared", "per-layer"]),
+    all_allowed(value_normalization=["running", "popart"]),
 )
 COMBINED += [
-    {"conditioning": "parameters", "scaling": scaling, "sampler": sampler}
+    row
     for scaling, sampler in itertools.zip_longest(SCALINGS, SAMPLERS, fillvalue="uniform")
+    if allowed(row := {"conditioning": "parameters", "scaling": scaling, "sampler": sampler})
 ]
 COMBINED += [
     {"conditioning": conditioning, "representation": kind, **rest}
@@ -543,7 +545,6 @@ COMBINED += [
         ("one-hot", "hip-bmdp", {"unseen_theta": "inferred", "heads": "per-task"}),
     ]
 ]
-COMBINED = [row for row in COMBINED if allowed(row)]
 
 
 def test_most_combinations_are_allowed():

@@ -515,7 +515,7 @@ def test_an_agent_with_other_defaults_names_its_file(forget, tmp_path):
     flag = f"--import={file}"
     config = run_config.parse([flag, "--agent=my-care"])
     assert config.imports == (str(file),) and flag in to_flags(config)
-    assert keywords.configured("finger-spin", "my-care", {}, plan={}).imports == (str(file),)
+    assert keywords.from_keywords("finger-spin", "my-care", {}, plan={}).imports == (str(file),)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from mtjax.agents import settings as settings_of
 from mtjax.agents import swept as points
 from mtjax.agents.fit import reset_networks
 from mtjax.command import run_config, sweep
-from mtjax.command.keywords import configured
+from mtjax.command.keywords import from_keywords
 from mtjax.config import configure
 from mtjax.learning import loop
 from mtjax.learning.evaluation import Scores, load_evaluations, save_evaluations
@@ -182,7 +182,7 @@ def test_one_point_that_diverges_does_not_end_the_others():
 def of_three_points(**plan):
     """A configuration whose sweep has one seed of each of three points."""
     sweep = {"tau": [0.1, 0.2, 0.3]}
-    return configured(Walk(), tiny("sac"), SMALL, plan=plan, sweep=sweep)
+    return from_keywords(Walk(), tiny("sac"), SMALL, plan=plan, sweep=sweep)
 
 
 def test_a_seed_that_diverged_stays_given_up(capsys):
@@ -583,7 +583,7 @@ def test_fine_tuning_begins_every_point_with_the_same_seeds(swept):
     """Three seeds of each of two points, from a run of two seeds: 0, 1, 0 and again 0, 1, 0."""
     start = mtjax.load(swept / "run-1", seed=0)
     tasks, sweep = start.env.tasks("train"), {"tau": [0.1, 0.2]}
-    config = configured(start.env, start.agent, SMALL, plan={"seeds": 3}, start=start, sweep=sweep)
+    config = from_keywords(start.env, start.agent, SMALL, plan={"seeds": 3}, start=start, sweep=sweep)
     run = _Run(config, Hooks(start=start, quiet=True))
     seeds, numbers = run.entries.axis
     shapes = jax.eval_shape(lambda: loop.init(start.env, config.trained, config.training, tasks, seeds, numbers)).agent

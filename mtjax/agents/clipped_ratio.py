@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mtjax.agents import critics
 from mtjax.agents.critics import MIN_STD, Units
+from mtjax.agents.on_policy import OnPolicy
 from mtjax.agents.parts import targets
 from mtjax.agents.rates import discounts_of_all
 from mtjax.agents.state import AgentState
@@ -31,7 +32,7 @@ class Assessed(NamedTuple):
 
 
 def assess(
-    agent: Any, state: AgentState, steps: Transition, tasks: Task, apart: Callable[[Any], Any] | None = None
+    agent: OnPolicy, state: AgentState, steps: Transition, tasks: Task, apart: Callable[[Any], Any] | None = None
 ) -> tuple[AgentState, Transition]:
     """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it.
 
@@ -67,7 +68,7 @@ def advantages(
     return advantage.reshape(value.shape), jax.vmap(normalize, 1, 1)(advantage).reshape(value.shape)
 
 
-def gae(agent: Any, tasks: Task, steps: Transition, value: Array, next_value: Array) -> Array:
+def gae(agent: OnPolicy, tasks: Task, steps: Transition, value: Array, next_value: Array) -> Array:
     """Compute the generalised advantages (T, H, E) of a rollout."""
     of_task = jax.vmap(partial(targets.gae, lambda_=agent.gae_lambda))
     return of_task(steps, value, next_value, discounts_of_all(agent, tasks))

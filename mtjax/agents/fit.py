@@ -111,7 +111,7 @@ def descend(
         seen: networks that the loss sees in place of the state's.
     """
     fitted = fits[name].step(state.fits[name], loss, state.nets | (seen or {}), data, key, importance)
-    fitted = fitted._replace(metrics={f"{name}_{key}": value for key, value in fitted.metrics.items()})
+    fitted = fitted._replace(metrics={f"{name}_{metric}": value for metric, value in fitted.metrics.items()})
     return state._replace(nets=state.nets | fitted.nets, fits=state.fits | {name: fitted.state}), fitted
 
 

@@ -55,7 +55,7 @@ class Batch(NamedTuple):
     followed: None = None  # as a rollout keeps what followed every step
 
 
-def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
+def losses_of(agent: "OnPolicy", state: AgentState, window: Transition, tasks: Task, key: Key) -> Losses:
     """Return the losses of actor and critic on windows (T, B, L, ...) of a rollout that the agent has assessed."""
     state, batch = agent.prepare(state, window, tasks)
     error = jnp.mean(jnp.abs(critics.Units.of(state).rewards(batch.target) - batch.value), axis=1)
@@ -64,11 +64,11 @@ def losses_of(agent: Any, state: AgentState, window: Transition, tasks: Task, ke
         return agent.critic_loss(nets, batch)[0], {"td_error": error}
 
     batch = with_models(agent, state, batch, key)
-    actor = partial(actors_loss, agent), (batch, jax.random.split(key, state.num_tasks))
+    actor = partial(actor_step_loss, agent), (batch, jax.random.split(key, state.num_tasks))
     return Losses(state.nets, {"critic": (above_least(agent, critic_loss), (batch, error)), "actor": actor}, batch)
 
 
-def actors_loss(agent: Any, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+def actor_step_loss(agent: "OnPolicy", nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
     """Return the loss of one task in the actor's step, where ``knowing`` may learn from the critic's loss too."""
     loss, aux = agent.actor_loss(nets, batch, key)
     if not (agent.conditioning.by_actor and nets["knowing"].parts):
@@ -76,7 +76,7 @@ def actors_loss(agent: Any, nets: Nets, batch: Batch, key: Key) -> tuple[Array, 
     return loss + CRITICS_WEIGHT * agent.critic_loss(nets, batch)[0], aux
 
 
-def with_models(agent: Any, state: AgentState, batch: Batch, key: Key) -> Batch:
+def with_models(agent: "OnPolicy", state: AgentState, batch: Batch, key: Key) -> Batch:
     """Return a batch (T, B, ...) with targets of the representation's models, if it learns."""
     if not agent.representation.learns:
         return batch
@@ -235,7 +235,7 @@ class OnPolicy(BaseAgent):
         importance = self.sampler.weights(state.nets["sampler"].own, jnp.ones(len(tasks.id)))
         batch = self.view.keyed(with_models(self, state, batch, key), jax.random.fold_in(key, 4))
         # The actor is first, as pi_old was on what the critic's step moves too: the representation, and what is known.
-        data, loss = (batch, jax.random.split(sample_key, len(tasks.id))), partial(actors_loss, self)
+        data, loss = (batch, jax.random.split(sample_key, len(tasks.id))), partial(actor_step_loss, self)
         moved, actor = descend(self.fits, "actor", state, loss, data, actor_order, importance)
         state = self.accept(moved, state, actor.aux.kl)
         loss = above_least(self, self.critic_loss)

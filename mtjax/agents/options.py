@@ -249,14 +249,14 @@ class Options(OnPolicy):
     def assess(self, state: AgentState, steps: Transition, tasks: Task) -> tuple[AgentState, Transition]:
         """Add advantages and targets to a rollout (T, H, E, ...), and fit the critic's units to it."""
         flat, features, obs, next_obs = self.view.steps(state, windows(steps, self.unroll), tasks)
-        taken, of_tasks = flat.extras, partial(known_of, self, state)
+        taken, of_tasks = flat.extras, partial(values_of, self, state)
         here, then = of_tasks(features, obs), of_tasks(features, next_obs)
         there = features, next_obs, taken.now.option, tasks.action_mask
         ends = over_tasks(partial(ending, self), state.nets, *there)
         upon = arrival(then, taken.now.option, ends, self.deliberation_cost)
         in_order = partial(played, shape=steps.reward.shape, length=self.unroll)
-        of_option, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
-        known = of_option, upon, reward, here.state, at_option(here.options, taken.before)
+        of_chosen, reward = at_option(here.options, taken.now.option), critics.rewards(self, state, flat, tasks)
+        known = of_chosen, upon, reward, here.state, at_option(here.options, taken.before)
         value, next_value, reward, of_state, of_before = map(in_order, known)
         advantage = clipped_ratio.gae(self, tasks, steps._replace(reward=reward), value, next_value)
         target = value + advantage
@@ -288,7 +288,7 @@ class Options(OnPolicy):
         gain, metrics = clipped_ratio.gain(self, log_ratio, batch)
         entropy = jnp.mean(self.policy.entropy(outputs, batch.mask, key))
 
-        logs = jax.nn.log_softmax(choices(self, nets, batch.features, batch.obs))
+        logs = jax.nn.log_softmax(option_logits(self, nets, batch.features, batch.obs))
         option_ratio = limited(at_option(logs, option) - taken.option_log_prob)
         choice, _ = clipped_ratio.gain(self, option_ratio, batch._replace(advantage=batch.choice_advantage))
         doubt = -jnp.sum(jnp.exp(logs) * logs, axis=-1)
@@ -316,7 +316,7 @@ class Options(OnPolicy):
         return state, Batch(obs=obs, features=features, mask=tasks.action_mask, **flat.extras._asdict())
 
 
-def chooser(agent: Any) -> Network:
+def chooser(agent: Options) -> Network:
     """Return the network of the policy over options."""
     return network_of(agent, "actor")
 
@@ -336,18 +336,18 @@ def arrival(values: Values, option: Array, ends: Array, cost: float | Array) -> 
     return (1 - ends) * at_option(values.options, option) + ends * (values.state - cost)
 
 
-def of_option(agent: Any, net: Any, seen: Array, option: Array) -> Array:
+def of_option(agent: Options, net: Any, seen: Array, option: Array) -> Array:
     """Return the outputs (..., P) of sub-policies or of terminations for inputs (..., O); 0 for no option."""
     return agent.actor.apply(net, jnp.zeros(0), with_due(seen, option, agent.num_options))
 
 
-def for_actions(agent: Any, nets: Nets, seen: Array, option: Array) -> Array:
+def for_actions(agent: Options, nets: Nets, seen: Array, option: Array) -> Array:
     """Return those outputs (..., P) of sub-policies for inputs (..., O) that the policy reads: all but STOP."""
     outputs = of_option(agent, nets["actor"], seen, option)
     return outputs[..., :-1] if agent.endings == "stop" else outputs
 
 
-def ends_of(agent: Any, nets: Nets, seen: Array, option: Array, mask: Array | None) -> Array:
+def ends_of(agent: Options, nets: Nets, seen: Array, option: Array, mask: Array | None) -> Array:
     """Return the probabilities (...) with which options (...) end for inputs (..., O); any number for no option."""
     if agent.endings == "learned":
         return jax.nn.sigmoid(of_option(agent, nets["termination"], seen, option)[..., 0])
@@ -355,19 +355,19 @@ def ends_of(agent: Any, nets: Nets, seen: Array, option: Array, mask: Array | No
     return jax.nn.sigmoid(outputs[..., -1] - jax.nn.logsumexp(allowed(outputs[..., :-1], mask), axis=-1))
 
 
-def known_of(agent: Any, state: AgentState, features: Array, obs: Any) -> Values:
+def values_of(agent: Options, state: AgentState, features: Array, obs: Any) -> Values:
     """Return the values of observations (T, B, ...) in units of reward."""
     q = critics.values(agent, state, features, obs)
-    over = over_tasks(partial(choices, agent), state.nets, features, obs)
+    over = over_tasks(partial(option_logits, agent), state.nets, features, obs)
     return Values(q, jnp.sum(jax.nn.softmax(over) * q, axis=-1))
 
 
-def choices(agent: Any, nets: Nets, features: Array, obs: Any) -> Array:
+def option_logits(agent: Options, nets: Nets, features: Array, obs: Any) -> Array:
     """Return the logits (B, K) of the policy over options."""
     return chooser(agent).apply(nets["over_options"], *agent.view.actor_inputs(nets, features, obs))
 
 
-def ending(agent: Any, nets: Nets, features: Array, obs: Any, option: Array, mask: Array | None = None) -> Array:
+def ending(agent: Options, nets: Nets, features: Array, obs: Any, option: Array, mask: Array | None = None) -> Array:
     """Return the probabilities (B,) with which options (B,) end; any number for no option."""
     _, seen = agent.view.actor_inputs(nets, features, obs)
     return ends_of(agent, nets, seen, option, mask)

@@ -112,6 +112,10 @@ class SAC(BaseAgent):
         action, _, log_prob = self.policy.draw(self.policy_outputs(nets, batch.features, obs), batch.mask, key)
         return Sample(action, log_prob, log_prob)
 
+    def sample_and_fit(self, nets: Nets, batch: Batch, key: Key) -> tuple[Sample, Any]:
+        """Sample actions at a batch's observations for the actor loss, with new running statistics of the actor."""
+        return self.sample(nets, batch, batch.obs, key), {}
+
     def q(self, nets: Nets, features: Array, obs: Any, action: Array) -> Array:
         """Return every critic's outputs (N, B, outputs)."""
         features, inputs = self.view.critic_inputs(nets, features, obs)
@@ -146,11 +150,11 @@ class SAC(BaseAgent):
 
     def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
         """Compute the actor loss, with what holds the actor to earlier tasks of a sequence."""
-        action, log_prob, cost = self.sample(nets, batch, batch.obs, key)
+        (action, log_prob, cost), statistics = self.sample_and_fit(nets, batch, key)
         held = self.continual.penalty(nets, self, jax.random.fold_in(key, 1))
         value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
         loss, entropy = jnp.mean(batch.temperature * cost - value), -jnp.mean(log_prob)
-        return loss + held, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy)
+        return loss + held, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy, statistics)
 
     def temperature_loss(self, nets: Nets, entropy: Array, action_size: Array) -> tuple[Array, None]:
         """Compute the loss of one task's temperature, by the entropy () of its policy."""

@@ -1,7 +1,7 @@
 """Sketches learn a sub-policy for every symbol of which tasks' sketches are made."""
 
 import dataclasses
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -138,7 +138,7 @@ def lean_to_stop(actor: Params, bias: float | Array) -> Params:
     return with_head(actor, lambda head: head | {"bias": head["bias"].at[..., -1].add(bias)})
 
 
-def with_lengths(agent: Any, state: AgentState, tasks: Task) -> AgentState:
+def with_lengths(agent: OnPolicy, state: AgentState, tasks: Task) -> AgentState:
     """Return a state whose curriculum knows the lengths of sketches, if tasks have any and the sampler is by-length."""
     if not isinstance(agent.sampler, ByLength) or "length" not in tasks.goal:
         return state

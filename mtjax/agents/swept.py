@@ -46,7 +46,7 @@ def agent_at(agent: BaseAgent, point: Point) -> BaseAgent:
     return _replace_values(agent, point, dataclasses.replace)
 
 
-def agents_at(agent: Any, points: Sequence[Point]) -> list[Any]:
+def agents_at(agent: BaseAgent, points: Sequence[Point]) -> list[BaseAgent]:
     """Return the agent at every point, or the agent itself if there are no points."""
     return [agent_at(agent, point) for point in points] or [agent]
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mtjax.agents import replay_batches
+from mtjax.agents.base import BaseAgent
 from mtjax.agents.fit import learned
 from mtjax.agents.parts.policies import Policy
 from mtjax.agents.state import AgentState, of_task
@@ -23,7 +24,7 @@ def consolidates(agent: Agent) -> bool:
     return way.keeps or way.reset_optimizer or way.restarts or agent.plasticity.changes
 
 
-def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
+def consolidate(agent: BaseAgent, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
     """Return the state with which a task ends, of an agent that played it alone.
 
     Its way to remember renews what it keeps, and learns on if it does; then optimisers begin anew if they should.
@@ -37,7 +38,7 @@ def consolidate(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key
     return state
 
 
-def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> tuple[Any, Any, Any]:
+def _policy(agent: BaseAgent, state: AgentState, draw: Draw, tasks: Task, key: Key) -> tuple[Any, Any, Any]:
     """Return the actor's outputs as a function of shared parameters and an input, their information, and inputs."""
     count, nets = agent.continual.samples, of_task(state.nets, jnp.int32(0))
     if not count:
@@ -51,7 +52,7 @@ def _policy(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) ->
     return outputs, partial(information, agent.policy, mask), inputs
 
 
-def _seen(agent: Any, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
+def _seen(agent: BaseAgent, state: AgentState, window: Transition, tasks: Task) -> tuple[Array, Any]:
     """Return features (T, ...) and observations (T, N, ...) of windows, as ``agent.view.actor_inputs`` takes them."""
     if agent.experience.storage.kept:
         batch = replay_batches.prepare(agent, state, window, tasks)
@@ -68,7 +69,7 @@ def information(policy: Policy, mask: Array | None, outputs: Array) -> Array:
     return jnp.diagonal(jax.hessian(lambda others: policy.divergence(outputs, others, mask))(outputs))
 
 
-def _retrain(agent: Any, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
+def _retrain(agent: BaseAgent, state: AgentState, draw: Draw, tasks: Task, key: Key) -> AgentState:
     """Take the updates that follow a consolidation."""
     way = agent.continual
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.base import BaseAgent
 from mtjax.agents.networks import Params
 from mtjax.agents.state import AgentState
 from mtjax.types import Acted, Array, Key, Spec, Task, Transition
@@ -19,7 +20,7 @@ class Teacher(NamedTuple):
     each task in its run; and of several runs each task's context there.
     """
 
-    agent: Any
+    agent: BaseAgent
     num_tasks: int  # that each run was trained on
     context_size: int  # size of their contexts
     num_runs: int
@@ -66,7 +67,7 @@ def join(states: Sequence[AgentState], run: Array, number: Array, context: Array
     return Params({}, {"state": state, "number": number, "context": context})
 
 
-def leave(agent: Any, state: AgentState) -> tuple[Any, AgentState]:
+def leave(agent: BaseAgent, state: AgentState) -> tuple[Any, AgentState]:
     """Return an agent and its state without the teacher, whom nobody needs who acts."""
     nets = {name: net for name, net in state.nets.items() if name != "teacher"}
     return dataclasses.replace(agent, teacher=None), state._replace(nets=nets)

@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from mtjax.agents.base import BaseAgent
 from mtjax.agents.networks import Network, Params, ReLU
 from mtjax.agents.parts.plasticity import NET, Layer, forget
 from mtjax.agents.state import AgentState, Nets, over_tasks
@@ -17,7 +18,7 @@ from mtjax.types import Array, Key
 _MLP = "MLP_0"  # flax's name of the layers of a trunk
 
 
-def begin(agent: Any, nets: Nets) -> Nets:
+def begin(agent: BaseAgent, nets: Nets) -> Nets:
     """Return what is remembered of the units of new networks, as a network by name."""
     if not agent.plasticity.every:
         return {}
@@ -29,7 +30,7 @@ def begin(agent: Any, nets: Nets) -> Nets:
     return {NET: Params({name: of_net(nets[name]) for name in ("actor", "critic")}, {})}
 
 
-def renew(agent: Any, state: AgentState, batch: Any, key: Key, number: Array) -> AgentState:
+def renew(agent: BaseAgent, state: AgentState, batch: Any, key: Key, number: Array) -> AgentState:
     """Begin units anew after update ``number`` (), if it is time for that, by what they put out for a batch (T, B)."""
     every = agent.plasticity.every
     if not every:
@@ -38,7 +39,7 @@ def renew(agent: Any, state: AgentState, batch: Any, key: Key, number: Array) ->
     return act(state) if every == 1 else jax.lax.cond((number + 1) % every == 0, act, lambda state: state, state)
 
 
-def _renew(agent: Any, batch: Any, key: Key, state: AgentState) -> AgentState:
+def _renew(agent: BaseAgent, batch: Any, key: Key, state: AgentState) -> AgentState:
     actions = (batch.action,) if agent.num_critics else ()
     seen = {
         "actor": over_tasks(agent.view.actor_inputs, state.nets, batch.features, batch.obs),
@@ -58,7 +59,7 @@ def _renew(agent: Any, batch: Any, key: Key, state: AgentState) -> AgentState:
     return state._replace(nets=nets | {NET: Params(kept, {})}, fits=fits)
 
 
-def _of_network(agent: Any, network: Network, seen: tuple, shared: Any, memory: list, key: Key) -> tuple:
+def _of_network(agent: BaseAgent, network: Network, seen: tuple, shared: Any, memory: list, key: Key) -> tuple:
     """Return the shared parameters of one network, what is remembered, and which units of each layer begin anew."""
     layers = jax.vmap(partial(hidden_layers, network, Params(shared, {})))(*seen)  # leaves (T, B, H)
     memories, begun = [], []

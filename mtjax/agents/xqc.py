@@ -11,8 +11,8 @@ from mtjax.agents.hyperparameters import FLAT
 from mtjax.agents.parts.encoders import BatchNorm, Encoder
 from mtjax.agents.parts.knowing import Knowing, Parameters
 from mtjax.agents.parts.scaling import ReturnNormalization, Scaling
-from mtjax.agents.parts.values import C51, Value, reduce
-from mtjax.agents.replay_batches import ActorAux, Batch, CriticAux
+from mtjax.agents.parts.values import C51, Value
+from mtjax.agents.replay_batches import Batch, CriticAux, Sample
 from mtjax.agents.sac import SAC
 from mtjax.agents.state import Nets
 from mtjax.types import Array, Key
@@ -63,7 +63,7 @@ class XQC(SAC):
     value: Annotated[Value, FLAT] = dataclasses.field(default_factory=lambda: C51(value_low=-5.0, value_high=5.0))
     scaling: Annotated[Scaling, FLAT] = dataclasses.field(default_factory=ReturnNormalization)
 
-    # Losses of one task.
+    # Losses of one task. That of the actor is SAC's, with actions of a policy that normalises by the batch.
 
     def q_of_both(self, nets: Nets, batch: Batch, next_action: Array) -> tuple[Array, Array, Any]:
         """Apply every critic to both ends of the transitions as one batch.
@@ -91,9 +91,7 @@ class XQC(SAC):
         loss = jnp.mean(jnp.sum(self.value.loss(q, target.target), axis=0))
         return replay_batches.fitted(self, loss, q, target.target, nets, batch, statistics)
 
-    def actor_loss(self, nets: Nets, batch: Batch, key: Key) -> tuple[Array, ActorAux]:
+    def sample_and_fit(self, nets: Nets, batch: Batch, key: Key) -> tuple[Sample, Any]:
         outputs, statistics = self.actor.fit(nets["actor"], *self.view.actor_inputs(nets, batch.features, batch.obs))
         action, _, log_prob = self.policy.draw(outputs, batch.mask, key)
-        value = reduce(self.values(nets, batch.features, batch.obs, action), self.critic_reduction == "min")
-        loss, entropy = jnp.mean(batch.temperature * log_prob - value), -jnp.mean(log_prob)
-        return loss, ActorAux({"actor_loss": loss, "entropy": entropy}, entropy, statistics)
+        return Sample(action, log_prob, log_prob), statistics

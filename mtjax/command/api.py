@@ -8,7 +8,7 @@ from typing import Any
 from mtjax.agents import preset_of
 from mtjax.agents.swept import Sweep
 from mtjax.checks import checked, path, shown
-from mtjax.command.keywords import configured
+from mtjax.command.keywords import from_keywords
 from mtjax.config import Plan
 from mtjax.learning.loop import Settings
 from mtjax.names import InputError, public
@@ -123,7 +123,7 @@ def train(
     plan |= {name: value for name, value in may_be_none.items() if value is not None}
     if agent is None and begun is not None:
         agent = (begun if isinstance(begun, Policy) else begun[0]).agent
-    config = configured(env, agent, given, plan=plan, settings=settings, start=begun, sweep=sweep, **written)
+    config = from_keywords(env, agent, given, plan=plan, settings=settings, start=begun, sweep=sweep, **written)
     check(config, begun)
     folder = None if directory is None else prepare(config, path(directory), resume)
     result = launch(config, Hooks(folder, begun, resume, on_chunk, quiet=quiet, label=label))

@@ -20,7 +20,7 @@ from mtjax.saved.policy import Policy
 from mtjax.types import Agent, Env
 
 
-def configured(
+def from_keywords(
     env: Any,
     agent: Any,
     given: Mapping[str, Any],

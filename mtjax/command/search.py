@@ -90,7 +90,7 @@ def read_ranges(argv: Sequence[str]) -> tuple[dict[str, tuple[float, float]], li
     return found, rest
 
 
-def configured(argv: Sequence[str]) -> tuple[RunConfig, Search]:
+def parse_search(argv: Sequence[str]) -> tuple[RunConfig, Search]:
     """Return the configuration of one setting, and the search around it, before memory limits its rounds.
 
     Raises:
@@ -155,7 +155,7 @@ def main(argv: Sequence[str]) -> None:
             raise InputError("the trials of a search are as long as they were; leave out --steps")
         parse(argv)  # which imports the user's own files
         return _go_on(Path(resume))
-    config, search = configured(argv)
+    config, search = parse_search(argv)
     require_library("optuna", "--search")
     check(config.checked(points=(dict(search.preset),)), load_start(config))
     search = _fitting(config, search)

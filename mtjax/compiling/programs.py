@@ -14,7 +14,7 @@ from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import begin, evaluate, play_on
 from mtjax.learning.loop import TrainState, init, run_chunk
 from mtjax.parallel.mesh import BY_SEED, BY_WORLD, REPLICATED
-from mtjax.types import Agent
+from mtjax.types import Agent, Env
 
 Runs = Literal["once", "seldom", "often"]
 _CUBLAS = {"xla_gpu_enable_triton_gemm": False}
@@ -78,7 +78,7 @@ def _split(mesh: Mesh, program: Callable, inputs: tuple, outputs: Any, donated: 
 _DONATED = {init: (), run_chunk: (1,), evaluate: (), begin: (), play_on: ()}
 
 
-def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) -> jax.stages.Traced:
+def trace(function: Any, env: Any, agent: Agent, setting: Any, *arguments: Any) -> jax.stages.Traced:
     """Trace a jitted function of three static arguments, or read it from the cache if it was traced before."""
     static = (env, agent, setting)
     if function not in _DONATED or not isinstance(env, FamilyOrMixture):  # the first if it is split over devices
@@ -86,7 +86,7 @@ def trace(function: Any, env: Any, agent: Any, setting: Any, *arguments: Any) ->
     return trace_cache.trace(env, function, _DONATED[function], static, arguments)
 
 
-def load_kernels(env: Any) -> bool:
+def load_kernels(env: Env) -> bool:
     """Compile or load what an environment runs outside XLA. XLA may compile meanwhile.
 
     Returns:

@@ -102,7 +102,7 @@ def _require_turns(settings: Settings, agent: Agent) -> None:
         raise InputError(f"{told} needs a rule of gradients without memory of the tasks, such as mean or pcgrad")
 
 
-def _require_way_back(settings: Settings, env: Any) -> None:
+def _require_way_back(settings: Settings, env: Env) -> None:
     """Refuse a curriculum that asks worlds to go back to their start, where they are reset or have no task for it."""
     if not settings.plays.goes_back:
         return

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mtjax.types import Array, Key, Step, Task
+from mtjax.types import Array, Env, Key, Step, Task
 
 
 def over_seeds(function: Callable, *axes: Any) -> Callable:
@@ -121,10 +121,10 @@ def observe_worlds(self: Any, tasks: Task, states: Any) -> Any:
 
 
 @partial(jax.jit, static_argnums=0)  # tracing physics takes seconds: do it once for all programs
-def _reset(env: Any, task: Task, key: Key) -> Step:
+def _reset(env: Env, task: Task, key: Key) -> Step:
     return env.reset(task, key)
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(env: Any, task: Task, state: Any, action: Array) -> Step:
+def _step(env: Env, task: Task, state: Any, action: Array) -> Step:
     return env.step(task, state, action)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mtjax.agents.base import judged
+from mtjax.agents.base import BaseAgent, judged
 from mtjax.agents.parts.knowing.posterior import Posterior
 from mtjax.agents.state import of_task
 from mtjax.envs.engines import host
@@ -75,7 +75,7 @@ def _policy(runs: Any) -> Policy:
     return load(found[0].directory)
 
 
-def _require(agent: Any) -> None:
+def _require(agent: BaseAgent) -> None:
     if not isinstance(agent.conditioning, Posterior):
         raise InputError("posterior is of agents that believe something of their task: --agent.conditioning=posterior")
 
@@ -120,7 +120,7 @@ def _spread(rows: np.ndarray) -> np.ndarray:
     return places[np.unique(np.linspace(0, len(places) - 1, _SHOWN).round().astype(int))]
 
 
-def _read(agent: Any, state: Any, tasks: Task, steps: Transition) -> tuple[Any, dict[str, Any]]:
+def _read(agent: BaseAgent, state: Any, tasks: Task, steps: Transition) -> tuple[Any, dict[str, Any]]:
     """Return the beliefs (T, H, Z) before steps (T, H, ...), and what they foretell of these, on what came."""
     way = agent.conditioning.way
 

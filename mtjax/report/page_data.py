@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mtjax.config import RunConfig
+from mtjax.envs.mixtures import FamilyOrMixture
 from mtjax.learning.evaluation import Evaluations, load_evaluations
 from mtjax.names import SPLITS, InputError
 from mtjax.report.scoring import GIVEN
@@ -67,11 +68,11 @@ class Watched(NamedTuple):
 
     directory: Path
     config: RunConfig
-    env: Any  # whose tasks are listed, by default those of the run
+    env: FamilyOrMixture  # whose tasks are listed, by default those of the run
     metrics: Metrics
 
     @classmethod
-    def of(cls, directory: Path, config: RunConfig, env: Any = None) -> "Watched":
+    def of(cls, directory: Path, config: RunConfig, env: FamilyOrMixture | None = None) -> "Watched":
         """Return a run by its folder and its configuration."""
         return cls(directory, config, env or config.family, Metrics(directory / "metrics.csv"))
 

@@ -153,7 +153,7 @@ def with_tasks(
     return dataclasses.replace(policy, env=env), as_unseen(env.tasks("all"), trained), GIVEN
 
 
-def other_tasks(env: Any, vary: Mapping[str, Any], task_seed: int | None) -> Any:
+def other_tasks(env: FamilyOrMixture, vary: Mapping[str, Any], task_seed: int | None) -> FamilyOrMixture:
     """Return an environment with tasks of its own, as ``on_values`` or ``drawn_anew``; itself if none are asked for."""
     if vary:
         return on_values(env, vary)
@@ -212,7 +212,7 @@ def report(request: Any, vary: Mapping[str, str]) -> None:
     print(f"written to {directory}")
 
 
-def on_values(env: Any, vary: Mapping[str, Any]) -> Any:
+def on_values(env: FamilyOrMixture, vary: Mapping[str, Any]) -> Family:
     """Return a family with other values of its parameters, all in its training split, with contexts scaled as before.
 
     Raises:
@@ -225,14 +225,14 @@ def on_values(env: Any, vary: Mapping[str, Any]) -> Any:
     return made.scaled_as(env)
 
 
-def drawn_anew(env: Any, seed: int) -> Any:
+def drawn_anew(env: FamilyOrMixture, seed: int) -> FamilyOrMixture:
     """Return a family, or a mixture, whose goals or tasks another seed draws, with contexts scaled as before."""
     if isinstance(env, Family):
         return dataclasses.replace(env, task_seed=seed).scaled_as(env)
     return dataclasses.replace(env, families=tuple(drawn_anew(family, seed) for family in env.families))
 
 
-def as_unseen(tasks: Task, env: Any) -> Task:
+def as_unseen(tasks: Task, env: FamilyOrMixture) -> Task:
     """Number tasks (T,) for an agent that learned in ``env``: a task that it learned by its number, others beyond all.
 
     The numbers between are those of the held-out tasks of ``env``, which have sentences of their own.

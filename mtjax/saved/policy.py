@@ -223,8 +223,8 @@ def _filled(directory: Path, like: Any) -> Any:
 
 
 def policy_of(
-    env: Any,
-    agent: Any,
+    env: FamilyOrMixture,
+    agent: BaseAgent,
     found: Sequence[Point],
     seeds: Array,
     states: Any,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mtjax.agents.base import judged
+from mtjax.agents.base import BaseAgent, judged
 from mtjax.compiling.programs import Programs, compile_lowered, jit_programs, load_kernels, sharded_shapes, trace
 from mtjax.config import RunConfig
 from mtjax.envs.engines import host
@@ -318,7 +318,7 @@ def is_due(config: RunConfig, steps: int) -> bool:
     return steps // plan.interval > before // plan.interval or steps >= plan.steps
 
 
-def adopted(config: RunConfig, hooks: Hooks, agent: Any, fresh: Any) -> Any:
+def adopted(config: RunConfig, hooks: Hooks, agent: BaseAgent, fresh: Any) -> Any:
     """Return an agent's state with the values of the runs from which it begins, the same seeds for every point."""
     apart = lambda x: x.reshape(-1, config.plan.seeds, *x.shape[1:])
     together = lambda x: x.reshape(-1, *x.shape[2:])

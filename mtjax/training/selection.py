@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
 from mtjax.agents import swept
+from mtjax.agents.base import BaseAgent
 from mtjax.checks import amount
 from mtjax.config import RunConfig
 from mtjax.learning import populations
@@ -78,7 +79,7 @@ def _gather(mesh: Mesh | None) -> Any:
     return jax.jit(take) if mesh is None else jax.jit(take, out_shardings=NamedSharding(mesh, meshes.BY_SEED))
 
 
-def _explored(agent: Any, numbers: dict[str, np.ndarray], copies: np.ndarray, key: Any) -> dict[str, np.ndarray]:
+def _explored(agent: BaseAgent, numbers: dict[str, np.ndarray], copies: np.ndarray, key: Any) -> dict[str, np.ndarray]:
     """Return perturbed numbers of copies (S,). A value that the agent's constructor refuses is not taken."""
     found = populations.explore(numbers, copies, swept.shares(agent, numbers), key)
     allows = lambda name, k: swept.allows(agent, {name: float(found[name][k])})

@@ -87,7 +87,7 @@ class Nothing:
 # coefficient / 2 sum_i F_i (theta_i - theta*_i)^2 is added, where theta* are those that the last task left.
 
 
-def _no_anchor(self: Nothing, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
+def _first_anchor(self: Nothing, actor: Params, num_tasks: int, example: tuple, size: int) -> Nets:
     zeros = jax.tree.map(jnp.zeros_like, actor.shared)
     return {NET: Params({"anchor": Anchor(jax.tree.map(jnp.copy, actor.shared), zeros)}, {})}
 
@@ -115,7 +115,7 @@ class L2(Nothing):
     def __post_init__(self):
         parts.require_not_negative(self, "l2_coefficient")
 
-    init, penalty = _no_anchor, _pulled_by(lambda self: self.l2_coefficient)
+    init, penalty = _first_anchor, _pulled_by(lambda self: self.l2_coefficient)
 
     def consolidate(self, nets: Nets, outputs: Outputs, information: Information, inputs: Any) -> Nets:
         return _hold(nets, forgetting.l2(nets["actor"].shared))
@@ -137,7 +137,7 @@ class EWC(Nothing):
         parts.require_not_negative(self, "ewc_coefficient", "fisher_least")
         _require_group(self, "fisher_samples")
 
-    init, penalty = _no_anchor, _pulled_by(lambda self: self.ewc_coefficient)
+    init, penalty = _first_anchor, _pulled_by(lambda self: self.ewc_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
@@ -162,7 +162,7 @@ class MAS(Nothing):
         parts.require_not_negative(self, "mas_coefficient")
         _require_group(self, "mas_samples")
 
-    init, penalty = _no_anchor, _pulled_by(lambda self: self.mas_coefficient)
+    init, penalty = _first_anchor, _pulled_by(lambda self: self.mas_coefficient)
 
     @property
     def samples(self) -> int:  # type: ignore[override]
