@@ -1,10 +1,12 @@
 """Measure speed and one step's error for numbers of solver iterations, by domain and engine.
 
-    python benchmarks/solver_iterations.py [--envs NAME ...] [--engines mjx warp] [--settings 1/2 4/8 ...] [--json FILE]
+    python benchmarks/solver_iterations.py [--envs NAME ...] [--vary NAME=VALUES] [--engines mjx warp]
+                                           [--settings 1/2 4/8 ...] [--json FILE]
 
 States are those of random play. The error of a world is the largest difference of any velocity [m/s or rad/s] after
 one control step from that of MuJoCo C with its solver run until it improves no more; ``off`` is the share of worlds
-whose error exceeds ``--tolerance``. The smallest setting after which neither falls is the one to take.
+whose error exceeds ``--tolerance``. The smallest setting after which neither falls is the one to take. ``lost`` is the
+share of worlds whose velocities are not finite, or beyond 1e4, after ``--steps`` random actions.
 """
 
 import argparse
@@ -16,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import learning
 import mujoco
 import numpy as np
 from mujoco import batch
@@ -31,6 +34,7 @@ from mtjax.types import InputError, Task
 
 SETTINGS = ("1/2", "1/4", "2/4", "2/8", "3/6", "4/8", "6/12", "10/20")
 _HELD = 5  # control steps for which random play holds an action
+_FAST = 1e4  # [m/s or rad/s] that only a world has that blew up
 
 
 class Sample(NamedTuple):
@@ -45,6 +49,9 @@ class Sample(NamedTuple):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=domains(), help="default: one of every MuJoCo domain")
+    parser.add_argument(
+        "--vary", nargs="*", default=[], metavar="NAME=VALUES", help="what tasks differ in: friction=0.1"
+    )
     parser.add_argument("--engines", nargs="+", choices=("c", "mjx", "warp"), help="default: those for this device")
     parser.add_argument("--settings", nargs="+", default=SETTINGS, help="iterations/line-search iterations")
     parser.add_argument("--worlds", type=int, default=256 if jax.default_backend() == "cpu" else 8192)
@@ -75,7 +82,7 @@ def domains() -> list[str]:
 
 def measure(name: str, engines: tuple[str, ...], arguments: argparse.Namespace) -> Any:
     """Yield a row for every engine and setting of one environment."""
-    env = mtjax.make(name)
+    env = mtjax.make(name, **learning.family_settings([], arguments.vary, "none" if arguments.vary else None))
     if not isinstance(env, Domain):
         raise InputError(f"{name!r} is no family of one MuJoCo model, such as finger-spin")
     sample = play(env, min(arguments.sample, arguments.worlds), arguments.play)
@@ -154,7 +161,7 @@ def evaluate(engine: Engine, sample: Sample, arguments: argparse.Namespace) -> d
         return new, time.perf_counter() - before
 
     first, first_seconds = call(1)
-    call(arguments.steps)
+    speeds = np.abs(np.asarray(call(arguments.steps)[0].qvel)).max(axis=1)
     rates = [count * arguments.steps / call(arguments.steps, seed)[1] for seed in range(arguments.repeats)]
     errors = np.max(np.abs(np.asarray(first.qvel, np.float64)[:sampled] - sample.qvel), axis=1)
     errors = np.where(np.isfinite(errors), errors, np.inf)
@@ -163,6 +170,7 @@ def evaluate(engine: Engine, sample: Sample, arguments: argparse.Namespace) -> d
         "median": float(median),
         "p99": float(high),
         "off": float(np.mean(errors > arguments.tolerance)),
+        "lost": float(np.mean(~(speeds < _FAST))),  # which is true of NaN
         "steps_per_second": statistics.median(rates),
         "slowest": min(rates),
         "fastest": max(rates),
@@ -171,12 +179,14 @@ def evaluate(engine: Engine, sample: Sample, arguments: argparse.Namespace) -> d
     }
 
 
-HEADER = f"{'env':26} {'engine':6} {'setting':>7} {'median':>9} {'p99':>9} {'off':>7} {'steps/s':>12} {'compile':>8}"
+_ERRORS = f"{'median':>9} {'p99':>9} {'off':>7} {'lost':>7}"
+HEADER = f"{'env':26} {'engine':6} {'setting':>7} {_ERRORS} {'steps/s':>12} {'compile':>8}"
 
 
 def line(row: dict[str, Any]) -> str:
-    found = f"{row['median']:9.1e} {row['p99']:9.1e} {row['off']:7.2%} {row['steps_per_second']:12,.0f}"
-    return f"{row['env']:26} {row['engine']:6} {row['setting']:>7} {found} {row['compile_seconds']:6.1f} s"
+    errors = f"{row['median']:9.1e} {row['p99']:9.1e} {row['off']:7.2%} {row['lost']:7.2%}"
+    speed = f"{row['steps_per_second']:12,.0f} {row['compile_seconds']:6.1f} s"
+    return f"{row['env']:26} {row['engine']:6} {row['setting']:>7} {errors} {speed}"
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ LONGEST = 15.0
 class Display:
     """Shows how far something is: a bar on a terminal, plain lines elsewhere, nothing if ``quiet``."""
 
-    def __init__(self, total: float, quiet: bool = False, doing: str = "compiling"):
+    def __init__(self, total: int, quiet: bool = False, doing: str = "compiling"):
         self.total, self.quiet, self.bar = total, quiet, None
         if quiet or not sys.stdout.isatty():
             return

@@ -225,7 +225,7 @@ def test_a_run_without_metrics_tells_why_it_ended(module, tmp_path):
 
 def test_solver_iterations_are_those_of_a_mujoco_model(module):
     with pytest.raises(mtjax.InputError, match="'link' is no family of one MuJoCo model"):
-        next(module("solver_iterations").measure("link", ("c",), argparse.Namespace()))
+        next(module("solver_iterations").measure("link", ("c",), argparse.Namespace(vary=[])))
 
 
 def test_a_file_without_curves_is_told(module, tmp_path):

@@ -50,7 +50,7 @@ def telling(what: str, quiet: bool = False, at_once: bool = False) -> Iterator[C
     def tell() -> None:
         if ended.wait(_SOON):
             return
-        display = Display(1.0, doing=str(share))
+        display = Display(1, doing=str(share))
         show = lambda: display.doing(str(share), share.done) if display.bar else display.say(str(share))
         with contextlib.closing(display), contextlib.suppress(BrokenPipeError):  # whoever read has seen enough
             show()
