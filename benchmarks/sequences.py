@@ -70,7 +70,7 @@ _OF_GOALS = ("scratch", "none", "packnet:retrain_updates=2000", *_OF_GOALS)
 # Coefficients are a hundredth of Continual World's, as brc's values are at most 10 and those there some hundreds.
 _OF_CW = ("ewc:ewc_coefficient=200", "l2:l2_coefficient=2000", "mas:mas_coefficient=200", "clone")
 _OF_CW = ("scratch", "none", "packnet:retrain_updates=5000", *_OF_CW)
-# With less, engines of 32 bits blow up: at 0.02, 7 of 400 walkers within 50 random steps of MJX.
+# With 0.02, worlds blow up with the default iterations of MJX and Warp: docs/results/sequences.md.
 _FRICTIONS = {"vary": {"friction": "0.1,0.15,0.2,0.3,0.4,0.6,0.8,1.2,1.6,2"}, "split": "none"}
 _BLIND = {"conditioning": "none", "normalize_observations": True, "num_envs": 1024}
 _OF_FRICTIONS = ("scratch", "none", "redo", "continual-backprop", "shrink-and-perturb")
