@@ -213,9 +213,8 @@ def test_an_evaluation_that_takes_long_says_what_it_plays(result, monkeypatch, c
 
     def score(policy, episodes, seed, tasks, split, tell):
         tell(0.0)
-        time.sleep(0.01)
         tell(0.25)
-        time.sleep(0.1)
+        time.sleep(0.3)
         return {split: Scores(np.ones((2, len(policy.env.tasks(split).id), episodes.count)), {})}
 
     monkeypatch.setattr("mtjax.report.scoring.score", score)
@@ -224,8 +223,8 @@ def test_an_evaluation_that_takes_long_says_what_it_plays(result, monkeypatch, c
     monkeypatch.setattr(waiting, "_SOON", 0.01)
     mtjax.evaluate(result, split="train", episodes=3, quiet=quiet)
     lines = capsys.readouterr().out.splitlines()
-    assert all(re.fullmatch(r"playing 12 episodes: 25% done  0\.\d s, 0\.\d s left", line) for line in lines)
     assert bool(lines) != quiet
+    assert quiet or re.fullmatch(r"playing 12 episodes: 25% done  0\.\d s, 0\.\d s left", lines[-1])
 
 
 @pytest.mark.parametrize("run", [None, 3, "nowhere", ShortFinger()])
