@@ -96,7 +96,7 @@ def test_both_losses_train_the_memory_in_the_actors_step_in_ppo_and_the_critics_
     nets, one = of_task(state.nets, 0), pick(batch._replace(mask=None), 0)
     slope = lambda loss: jax.jit(jax.grad(lambda nets: loss(nets)[0]))(nets)["knowing"]
     actors, critics = slope(lambda nets: agent.actor_loss(nets, one, KEY)), slope(lambda x: agent.critic_loss(x, one))
-    both = slope(lambda nets: on_policy.actors_loss(agent, nets, one, KEY))
+    both = slope(lambda nets: on_policy.actor_step_loss(agent, nets, one, KEY))
     for found, *of_one in zip(*map(jax.tree.leaves, (both, actors, critics)), strict=True):
         assert all(np.any(np.asarray(x) != 0) for x in of_one)
         np.testing.assert_allclose(found, of_one[0] + 0.5 * of_one[1], rtol=1e-4, atol=1e-6)
