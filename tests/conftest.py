@@ -48,7 +48,7 @@ def pytest_configure(config):
     if files is not None:
         keep = {
             "jax_compilation_cache_dir": str(files.mkdir("xla")),
-            "jax_persistent_cache_min_compile_time_secs": 0.0,
+            "jax_persistent_cache_min_compile_time_secs": 0.1,  # what takes less is made as soon as it is read
             "jax_persistent_cache_min_entry_size_bytes": -1,
         }
         for name, value in keep.items():

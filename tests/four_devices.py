@@ -114,7 +114,7 @@ def test_donated_state_is_gone(tmp_path):
     assert metrics["return"].shape == (4, 2) and len(metrics["return"].sharding.device_set) == 4
 
 
-@pytest.mark.parametrize("count", [4, 2, 1])
+@pytest.mark.parametrize("count", [pytest.param(4, marks=NIGHTLY), 2, pytest.param(1, marks=NIGHTLY)])
 def test_checkpoint_goes_on_with_other_devices(alone, halfway, tmp_path, use, count):
     """What four devices saved, four, two or one take up."""
     use(count)
@@ -210,7 +210,7 @@ def test_two_seeds_on_two_devices_each(tmp_path, use, crowd, given):
     assert_same(result, share("one"), chunks=2)
 
 
-@pytest.mark.parametrize("before, after", [(4, 1), (1, 4)])
+@pytest.mark.parametrize("before, after", [pytest.param(4, 1, marks=NIGHTLY), (1, 4)])
 def test_checkpoint_goes_on_with_other_shares(wide_alone, tmp_path, use, crowd, before, after):
     """While the ring is half full, which it is in every part alike."""
     use(before)
@@ -306,7 +306,7 @@ def test_what_differs_is_made_the_first_devices():
     np.testing.assert_array_equal(counts, [1, 2, 2, 3])
 
 
-@pytest.mark.parametrize("rule", ["pcgrad", "famo"])
+@pytest.mark.parametrize("rule", ["pcgrad", pytest.param("famo", marks=NIGHTLY)])
 def test_rollouts_on_two_devices_are_learned_from_as_on_one(crowd, use, rule):
     """Gradients are averaged before they are compared, and so are moments, units and advantages.
 

@@ -228,18 +228,23 @@ def param(case, slow=False):
 
 
 def one_in(count, cases, nightly=False):
-    """All cases as a test's parameters, marked slow but for one in ``count``; ``nightly``: three of seven of these so.
+    """All cases as a test's parameters, marked slow but for one in ``count``, and ``nightly`` as ``_later`` says."""
+    return _later([(case, i % count == 0) for i, case in enumerate(cases)], nightly)
+
+
+def slow_but(names, *quick, nightly=False):
+    """All names as a test's parameters, marked slow but for the ``quick``, and ``nightly`` as ``_later`` says."""
+    return _later([(name, name in quick) for name in names], nightly)
+
+
+def _later(cases, nightly):
+    """Mark cases that are not quick as slow, and three of seven of these as ``nightly`` too, if that is so.
 
     Seven has no divisor in common with the length of most inner loops over cases, so that all values are in the rest.
     """
-    late = lambda i: [pytest.mark.nightly] if nightly and i % count and i % 7 in (1, 3, 5) else []
-    made = [(param(case, slow=i % count > 0), late(i)) for i, case in enumerate(cases)]
+    late = lambda i, quick: [pytest.mark.nightly] if nightly and not quick and i % 7 in (1, 3, 5) else []
+    made = [(param(case, slow=not quick), late(i, quick)) for i, (case, quick) in enumerate(cases)]
     return [pytest.param(*case.values, marks=[*case.marks, *marks]) for case, marks in made]
-
-
-def slow_but(names, *quick):
-    """All names as a test's parameters, marked slow but for the ``quick``."""
-    return [param(name, slow=name not in quick) for name in names]
 
 
 # The loop and the replay with which SAC learns what a probe asks for.

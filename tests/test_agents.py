@@ -51,22 +51,20 @@ VALID = [
 SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in OFF_POLICY]
 
 
-def some(cases, every, nightly=False):
-    """Cases of which one in so many is traced by default and all by .ci/run, less those that cannot be."""
+def some(cases, every):
+    """Cases of which one in so many is for the default, four of seven others for .ci/run; less those that cannot be."""
     cases = [(name, settings) for name, settings in cases if valid(name, **settings)]
-    return one_in(every, cases, nightly)
+    return one_in(every, cases, nightly=True)
 
 
-# Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share. Thirteen and
-# twenty-three have no divisor in common with the number of ways, so that every way is in the default. Of the many
-# conditionings .ci/run takes four of seven.
+# Each tells tasks apart in its own way, and pcgrad must compose with every network that tasks share.
 TRACED = [
-    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 17, nightly=True),
+    *some([(name, {"conditioning": conditioning}) for name, conditioning in VALID], 34),
     *some([(name, {"conditioning": conditioning, "gradients": "pcgrad"}) for conditioning, name in SURGERY], 31),
-    *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 7),
-    *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 5),
-    *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 3),
-    *some([(name, {"value": value}) for value in VALUES for name in ("sac-conditioned", "deepmdp")], 3),
+    *some([("sac-conditioned", {"gradients": rule}) for rule in RULES], 14),
+    *some([("sac-conditioned", {"gradients": rule, "gradient_scope": "per-layer"}) for rule in RULES], 10),
+    *some([("sac-conditioned", {"encoder": name}) for name in ENCODERS], 6),
+    *some([(name, {"value": value}) for value in VALUES for name in ("sac-conditioned", "deepmdp")], 6),
     *some([("multi-head", {"scaling": scaling, "reset_every": 100}) for scaling in SCALINGS], 2),
     *some([("sac-conditioned", {"sampler": sampler}) for sampler in SAMPLERS], 2),
 ]
@@ -132,7 +130,7 @@ def test_every_combination_has_the_right_shapes(name, settings, vectors):
         assert (actions.shape, actions.dtype) == ((3, ENVS, 2), jnp.float32)
 
 
-@pytest.mark.parametrize(("name", "settings"), some(RUN, 18), ids=label)
+@pytest.mark.parametrize(("name", "settings"), some(RUN, 36), ids=label)
 def test_agents_act_and_learn(name, settings, vectors):
     """Finite, the same for the same keys and different for others; acting in a batch is acting one at a time."""
     agent, keys, obs = make(name, settings, vectors), jax.random.split(KEY, (3, ENVS)), observations()
@@ -212,6 +210,7 @@ def test_the_context_limit_shows_a_task_beyond_the_range_as_its_end():
         np.testing.assert_allclose(agent.view.features_of_all(state, drawn, TASKS), -expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_agent_that_is_told_nothing_acts_alike_in_all_tasks():
     """And one that is told does not."""
     obs = jnp.ones((3, 1, 3))
@@ -221,6 +220,7 @@ def test_an_agent_that_is_told_nothing_acts_alike_in_all_tasks():
         assert (len(np.unique(np.asarray(actions), axis=0)) == 1) == (name == "sac")
 
 
+@pytest.mark.slow
 def test_observations_are_normalised_by_what_was_collected():
     """Each step counts once, and neither acting nor updates change the moments."""
     agent = tiny("sac", normalize_observations=True)
@@ -278,6 +278,7 @@ def test_without_normalisation_moments_stay_empty():
     assert after.nets["inputs"].shared["moments"].count == 0
 
 
+@pytest.mark.slow
 def test_gradients_are_clipped_to_their_norm():
     """Actor's and critics' each by its own global norm, and not at all by default; the direction stays."""
     batch, recorded = random_batch(0, 3, BATCH, SPEC), {}

@@ -180,6 +180,7 @@ def sail_on(state, action):
     return place, theta, v, w
 
 
+@pytest.mark.slow
 def test_a_boat_moves_by_the_equations_of_jaulin_and_le_bars():
     """Place, heading, speed and turning of 100 random actions; and what is observed of the last one."""
     env, task = alone("sailing")
@@ -227,6 +228,7 @@ def drive_on(state, action):
     return place, heading, v, beta, r, d
 
 
+@pytest.mark.slow
 def test_a_car_moves_by_the_single_track_model():
     """All of its state under 40 random actions."""
     env, task = alone("racing")
@@ -349,6 +351,7 @@ def tacking(task, state, angle):
     return upon(task, state, jnp.where(leads, -side, side) * angle)
 
 
+@pytest.mark.slow
 def test_tacks_reach_a_mark_to_windward_as_soon_as_the_polar_lets_them():
     """95 m away, where it is reached, and later by what a tack costs; straight ahead a boat goes nowhere."""
     best, tack = sailing.best_to_windward(7.0, 0.8)

@@ -52,6 +52,7 @@ def test_a_run_of_python_is_that_of_the_command_line(result, finished_run):
     assert names(result.directory) == names(finished_run)
 
 
+@pytest.mark.slow
 def test_progress_is_shown_unless_it_should_be_quiet(short_family, capsys):
     """Without being asked for, from the first seconds, in lines that need no terminal."""
     given = {"steps": 100, **PLAN, **SMALL}
@@ -175,9 +176,13 @@ _REDO = {"encoder": "identity", "unit_head": False, "plasticity": "redo"}
     [
         ("sac", {"scaling": "ars", "reset_every": 1000}),
         ("simba-v2", _REDO),
-        ("drq", {"pixels": 32, "n_step": 1, "conditioning": "recurrent", "representation": "plain"}),
-        ("drq", {"pixels": 32, "n_step": 1, "target": "retrace"}),
-        ("drq", {"pixels": 32, "n_step": 1, "representation": "deepmdp"}),
+        pytest.param(
+            "drq",
+            {"pixels": 32, "n_step": 1, "conditioning": "recurrent", "representation": "plain"},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("drq", {"pixels": 32, "n_step": 1, "target": "retrace"}, marks=pytest.mark.slow),
+        pytest.param("drq", {"pixels": 32, "n_step": 1, "representation": "deepmdp"}, marks=pytest.mark.slow),
         ("rl2", {"minibatches": 3, "unroll": 16}),
         ("sac", {"hidden": (8, 8, 8), "tune": "all", "combine": "grid", "split": "none", "stagger": False}),
     ],

@@ -85,6 +85,7 @@ def test_every_parameter_gets_a_gradient_and_none_flows_through_a_weight_of_zero
     assert not any(np.any(x[1]) for x in jax.tree.leaves(slopes)) and all(np.any(x[0]) for x in jax.tree.leaves(slopes))
 
 
+@pytest.mark.slow
 def test_tasks_without_a_weight_in_common_share_nothing():
     """A task that weighs only the first sub-network moves no other, nor its part of the head."""
     module = Attentive(2, ()).body(HIDDEN, False)

@@ -57,6 +57,7 @@ def taught():
 # What goes on.
 
 
+@pytest.mark.slow
 def test_each_option_acts_and_ends_as_the_sub_policy_of_its_symbol(taught):
     """By the same outputs in every place, of seed k modulo the run's seeds; all else is fresh, bit for bit."""
     agent = options()

@@ -77,6 +77,7 @@ def test_models_foretell_what_they_predict_on_average_over_a_belief():
     np.testing.assert_allclose(wide, expected.mean(axis=0), atol=5 * float(expected.std(axis=0).max()) / np.sqrt(64))
 
 
+@pytest.mark.slow
 def test_cadm_foretells_changes_of_state_and_pearl_nothing():
     made = knowing("cadm")
     params, track = params_of(made), track_of(made)

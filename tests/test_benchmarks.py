@@ -166,8 +166,8 @@ def unstopped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", slow_but(FILES, "learning"))
-@pytest.mark.parametrize("end", slow_but([terminate, die], terminate))
+@pytest.mark.parametrize("name", slow_but(FILES, "learning", nightly=True))
+@pytest.mark.parametrize("end", slow_but([terminate, die], terminate, nightly=True))
 def test_a_stopped_pair_goes_on_to_the_same_results(run, unstopped, tmp_path, monkeypatch, name, end):
     """It is in no table before, and leaves nothing but results."""
     if name not in unstopped:

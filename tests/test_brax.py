@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from needs import require
+from probes import slow_but
 
 import mtjax.envs.brax as adapter
 from mtjax.envs.brax import BACKENDS, NAMES, Brax, BraxAntDirection, BraxHalfcheetahSpeed
@@ -93,7 +94,7 @@ PENDULUM_MJX = Brax(environment="inverted_pendulum", backend="mjx")
 @pytest.mark.parametrize(
     "env",
     [
-        pytest.param(ANT, id="ant", marks=slow),
+        pytest.param(ANT, id="ant", marks=pytest.mark.nightly),
         pytest.param(CHEETAH, id="halfcheetah", marks=slow),
         pytest.param(PENDULUM_MJX, id="inverted_pendulum-mjx", marks=slow),
     ],
@@ -143,6 +144,7 @@ def test_a_falling_ant_obeys_its_gravity():
     assert np.all(step.terminated)  # as the ant must keep its torso between 0.2 and 1 m
 
 
+@pytest.mark.slow
 def test_an_edited_system_is_what_brax_loads_from_an_edited_model():
     """Every leaf: what MuJoCo derives from masses (constraint weights) included."""
     from brax.io import mjcf
@@ -242,7 +244,7 @@ def test_tasks_and_worlds_step_in_one_scan():
     assert np.all(np.diff(np.sum(falls, axis=1)) > 0)
 
 
-SMALL = ("ant", "fast", "inverted_pendulum")
+SMALL = ("fast", "inverted_pendulum")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in SMALL else slow) for name in NAMES])
@@ -263,7 +265,7 @@ SEEN += [(name, "generalized") for name in NAMES if name not in ("fast", "invert
 _QUICK = ("inverted_pendulum", "generalized")
 
 
-@pytest.mark.parametrize("name, backend", [pytest.param(*x, marks=[] if x == _QUICK else slow) for x in SEEN])
+@pytest.mark.parametrize("name, backend", slow_but(SEEN, _QUICK, nightly=True))
 def test_a_film_shows_bodies_where_brax_has_its_links(name, backend):
     """MuJoCo puts them there, given the joints that are shown."""
     env = Brax(environment=name, backend=backend)

@@ -136,7 +136,7 @@ def test_last_of_a_repeated_name_counts():
 PAIRS = [(env, "sac") for env in FEW] + [(family_for(agent), agent) for agent in AGENTS]
 
 
-@pytest.mark.parametrize("env, agent", one_in(5, PAIRS))
+@pytest.mark.parametrize("env, agent", one_in(5, PAIRS, nightly=True))
 def test_a_record_is_read_back_as_it_was(env, agent, tmp_path):
     """For every family and agent, with settings that no default has."""
     family = mtjax.make(env)
@@ -242,7 +242,7 @@ def test_environments_of_a_package_have_the_preset_of_their_kind(env, file):
 
 
 @pytest.mark.parametrize("preset", ("cpu", "gpu"))
-@pytest.mark.parametrize("env, agent", one_in(2, PAIRS))
+@pytest.mark.parametrize("env, agent", one_in(2, PAIRS, nightly=True))
 def test_every_preset_makes_a_program(env, agent, preset):
     """Its settings are allowed, and arrive."""
     program = with_preset(env, agent, preset)

@@ -128,7 +128,6 @@ MARKS: dict[str, Learns | str] = {
     "--seeds=8 --distributed --runs=/shared/runs": _HOSTS,
     "--env=pendulum-swingup --engine=mjx --seeds=2 --distributed": _HOSTS,
 }
-QUICK = list(MARKS)[:1]
 LEARNING = {command: mark for command, mark in MARKS.items() if isinstance(mark, Learns)}
 ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}  # programs as users get them
 
@@ -156,10 +155,8 @@ def test_readmes_example_in_python_learns(gain=15):
     assert len(returns) == 10 and returns[-1] - returns[0] > gain, returns
 
 
-@pytest.mark.parametrize(
-    "command",
-    [pytest.param(x, marks=pytest.mark.slow if x in QUICK else pytest.mark.nightly) for x in LEARNING],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("command", LEARNING)
 def test_a_command_learns(command, tmp_path):
     """Of all that a page trains, nothing may stay where it begins."""
     gain, flags = LEARNING[command]

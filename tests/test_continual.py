@@ -121,6 +121,7 @@ def learn_pruned(params, owners, task, share, x, y):
     return jax.jit(lambda params: learn(params, owners, task, x, y, seen))(params), owners
 
 
+@pytest.mark.slow
 def test_later_tasks_change_nothing_of_earlier_ones_to_the_bit():
     """Though they are others, and the optimiser decays weights; and each is learned."""
     x = jnp.float32(RANDOM.normal(size=(40, 2)))

@@ -345,6 +345,7 @@ def test_the_grid_s_caster_draws_what_the_general_one_draws():
     assert np.mean(turned) > 4 * np.mean(apart)
 
 
+@pytest.mark.slow
 def test_looks_vary_but_for_the_camera():
     env = seeing(repeat=1)
     varied = CorridorMaze(vary={"hue": "0,120", "floor-hue": "0,90"}, combine="paired", pixels=SIZE)

@@ -143,6 +143,7 @@ def test_own_parameters_are_taken_by_number_and_put_back():
     assert after["adam"][0] == 11
 
 
+@pytest.mark.slow
 def test_a_state_of_other_tasks_knows_these_alone():
     """Also where they are more than the training tasks: each has what its nearest one has for itself."""
     train = Walk().tasks()

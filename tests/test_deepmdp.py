@@ -390,6 +390,7 @@ def test_the_target_is_the_slow_encoders():
 STRANGER = pick(tasks_of("one-step", [0.2]), 0)._replace(id=jnp.int32(7))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["nearest", "zero", "mean"])
 def test_theta_of_an_unseen_task(strategy):
     """It acts as a training task that had that theta would; training tasks keep their own."""

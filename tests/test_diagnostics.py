@@ -129,6 +129,7 @@ def test_gradients_are_those_of_each_task_alone(name):
     np.testing.assert_allclose(found["td_error"], distance_to_reward(agent, state, batch), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_training_reports_what_diagnostics_do():
     """An update by PCGrad on the same batch sees the same; lengths and TD errors have columns for each task."""
     agent = tiny("pcgrad", hidden=(4,))
@@ -145,6 +146,7 @@ def test_training_reports_what_diagnostics_do():
         np.testing.assert_allclose([float(row[f"{name}_{t}"]) for t in range(3)], metrics[name], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_tasks_that_want_opposite_values_conflict():
     """Same steps, rewards of 100 and of -100, told nothing: cosines near 1 within a camp and near -1 between them."""
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), ended())
@@ -155,6 +157,7 @@ def test_tasks_that_want_opposite_values_conflict():
     assert found["conflict"] == pytest.approx(4 / 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", one_in(2, ["c51", "hl-gauss"]))
 def test_td_error_of_categorical_critics_is_in_units_of_reward(value):
     """|mean of the distribution - the reward| where every step is its episode's last."""
@@ -247,6 +250,7 @@ def test_effective_ranks_of_known_singular_values(values, rank, entropy_rank):
     assert found[0] == rank and found[1] == pytest.approx(entropy_rank, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_activity_is_that_of_the_networks():
     """Mean activity and hidden layers of every critic and of the actor are what the networks compute for each task."""
     agent = tiny("multi-head", hidden=(8, 4), normalize_observations=True)
@@ -272,7 +276,7 @@ def trace(agent):
     return state, gradients, seen
 
 
-@pytest.mark.parametrize("name", one_in(6, OFF_POLICY))
+@pytest.mark.parametrize("name", one_in(6, OFF_POLICY, nightly=True))
 def test_every_agent_has_diagnostics(name):
     """Matrices unless it is disjoint, TD errors for each task, and layers of both networks."""
     agent = tiny(name)
@@ -377,7 +381,7 @@ def test_memories_and_pictures_are_refused():
     refused(tiny("sac"), shown, "networks take vectors")
 
 
-@pytest.mark.parametrize("encoder", one_in(5, ENCODERS))
+@pytest.mark.parametrize("encoder", one_in(5, ENCODERS, nightly=True))
 def test_units_of_every_encoder_are_seen(encoder):
     """Layers of the right number of networks, all of ReLUs."""
     agent = tiny("xqc" if encoder == "batch-norm" else "sac", encoder=encoder, conditioning="one-hot", hidden=(16, 16))
@@ -518,6 +522,7 @@ def test_seeds_are_averaged(finished_run):
     np.testing.assert_allclose(both.td_error, means.td_error)
 
 
+@pytest.mark.slow
 def test_columns_of_a_run(finished_run):
     """TD errors of each task; lengths of gradients only where a rule looks at them."""
     with (finished_run / "metrics.csv").open(newline="") as file:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, Probe, pick, quick, tasks_of, tiny, train_objects
+from probes import QUICK, Probe, pick, quick, slow_but, tasks_of, tiny, train_objects
 from test_finetune import bits, named_aims
 
 import mtjax
@@ -163,7 +163,7 @@ def test_a_teacher_that_remembers_hears_of_every_step():
     assert memory.hidden.shape == (4,) and np.any(memory.teacher.hidden)
 
 
-@pytest.mark.parametrize("name", ["sac", "pqn", "options", "distral", "impala"])
+@pytest.mark.parametrize("name", slow_but(["sac", "pqn", "options", "distral", "impala"], "sac", "pqn"))
 def test_agents_tell_what_their_actions_are_drawn_from(name):
     """The likeliest action is that of these outputs, which are values in PQN."""
     spec = DISCRETE if name == "pqn" else SPEC

@@ -185,6 +185,7 @@ def slopes(made, nets, rows, loss):
     return own, found.shared["distilled"]
 
 
+@pytest.mark.slow
 def test_each_loss_reaches_its_own_policy_alone(state, batch):
     """The policy's never the distilled parameters, and distillation these alone, by its actions too."""
     made, rows = tiny("distral", distral_alpha=ALPHA), pick(batch, 1)
@@ -363,6 +364,7 @@ def test_training_tasks_play_their_own_policies_and_others_the_distilled_one(sta
     assert describe_unseen(made) == "the distilled policy plays them"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("conditioning", one_in(2, ["one-hot", "parameters", "embedding"]))
 def test_a_distilled_policy_may_be_told_the_task(conditioning):
     """As the others are; it then acts differently in different tasks."""
@@ -396,6 +398,7 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 # With PopArt.
 
 
+@pytest.mark.slow
 def test_with_popart_an_update_is_the_same_for_rewards_of_any_scale():
     """From the first one on, as the first units are those of rewards before it; temperatures are in these units."""
     scales, made = jnp.float32([0.01, 1.0, 100.0]), tiny("distral", scaling="popart", target_rate=0.1)

@@ -207,7 +207,7 @@ def test_pages_of_families_train_an_agent_that_acts_there(hooks, teacher, name):
     check_commands(hooks.family_page(name), teacher)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs("mkdocs")
 def test_pages_of_all_families_train_an_agent_that_acts_there(hooks, teacher):
     for name, (cls, _) in ENVS.items():

@@ -56,11 +56,8 @@ VARIED = {
 DOMAINS, SLOW = list(VARIED), pytest.mark.slow
 # MJX takes ten seconds to compile a domain with contact.
 QUICK_DOMAINS = ("pendulum-swingup",)
-LONG = (
-    "humanoid-walk",
-    "swimmer-swimmer6",
-    "finger-turn-easy",
-)  # MJX compiles two of them for long; the third is a finger too
+# MJX compiles three of them for long; the fourth is a finger too.
+LONG = ("humanoid-walk", "quadruped-walk", "swimmer-swimmer6", "finger-turn-easy")
 ALIKE = [name for name in DOMAINS if name != "dog-walk"]  # MJX and Warp step another dog: tests/test_bodies.py
 HEAVY = ("dog-walk", "humanoid-walk")  # whose play takes seconds
 # Bounds on each world's largest error in velocity, by quantile, relative to the domain's fastest velocity. MJX and Warp
@@ -129,7 +126,7 @@ def alone(engine, task, world, action):
     return state, np.float32(data.sensordata)
 
 
-@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY][::4]))
+@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY][::8]))
 def test_c_steps_as_plain_mujoco_does(name):
     """Bit for bit in every world, for three steps of which the later ones go on from the batch's own state."""
     tasks, world, action, _ = played(name)
@@ -252,12 +249,15 @@ for _ in range(200):
 """
 
 
+@pytest.mark.slow
 def test_a_process_may_end_while_its_worlds_still_step():
     """They are waited for: below a process that ends, a call would crash it."""
     subprocess.run([sys.executable, "-c", ENDS_EARLY], env=environment(), check=True, timeout=120)
 
 
-@pytest.mark.parametrize(("name", "sensors"), [("finger-spin", True), ("walker-walk", False)])
+@pytest.mark.parametrize(
+    ("name", "sensors"), [("finger-spin", True), pytest.param("walker-walk", False, marks=pytest.mark.slow)]
+)
 def test_c_results_do_not_depend_on_what_the_batch_did_before(name, sensors):
     """After a start, a question of contact, other worlds or other tasks, a step is that of a fresh engine.
 
@@ -287,6 +287,7 @@ def test_c_results_do_not_depend_on_what_the_batch_did_before(name, sensors):
     assert held and all(worlds.persistent == sensors for worlds in held)
 
 
+@pytest.mark.slow
 def test_extra_is_carried_along():
     """What a domain remembers passes through every method of an engine untouched, or is None."""
     env, mjx = family("finger-spin", engine="c"), mjx_engine(family("finger-spin", engine="mjx"))

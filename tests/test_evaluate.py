@@ -17,7 +17,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import Lost, Stub, Walk, pick, tasks_of
+from probes import Lost, Stub, Walk, one_in, pick, tasks_of
 from probes import act as act_once
 
 import mtjax
@@ -184,7 +184,7 @@ def test_nothing_is_played_long_after_all_episodes_have_ended(monkeypatch, early
 
 
 @pytest.mark.parametrize("parts", [1, 3, 100])
-@pytest.mark.parametrize("episodes", [Episodes(3), Episodes(6, 3), Episodes(3, sampled=True)])
+@pytest.mark.parametrize("episodes", one_in(3, [(Episodes(6, 3),), (Episodes(3),), (Episodes(3, sampled=True),)]))
 def test_an_evaluation_in_parts_is_one_as_a_whole(monkeypatch, parts, episodes):
     """Bit by bit, and it tells before each part how far it is; where all trials have ended it stops."""
     tasks = tasks_of("one-step", (1.0, -0.5, 2.0))._replace(horizon=jnp.int32([5, 4, 2]))
@@ -386,6 +386,7 @@ def filmed(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, filmed):
     """The first, the middle and the last; each tile names its task."""
     mtjax.evaluate.main([f"--run={copied_run}", "--episodes=1", "--video", "--video-seconds=0.2"])
@@ -407,6 +408,7 @@ def test_video_films_some_tasks_of_each_split_in_one_grid(copied_run, capsys, fi
     assert re.search(r"writing the film of \d+ pictures\nfilmed film: 6 tasks", out)
 
 
+@pytest.mark.slow
 def test_a_trial_is_filmed_episode_by_episode(copied_run, filmed, tmp_path, capsys):
     """Side by side, a line for each task; of a long trial the first ones and the last."""
     policy = dataclasses.replace(mtjax.load(copied_run), trial=2)
@@ -468,6 +470,7 @@ def test_a_film_that_ends_stands_still():
     assert np.all(whole[:, :2, :2] == 1) and np.all(whole[:, 2:, 2:] == 0) and np.all(whole[2, :2, 2:] == 2)
 
 
+@pytest.mark.slow
 def test_other_values_are_scored_as_the_run_scores_them(copied_run, capsys):
     """A value that trained keeps its number; contexts are scaled as in the run."""
     words = [f"--run={copied_run}", "--episodes=1", "--env.vary.size=0.9:1.2:4"]

@@ -54,7 +54,7 @@ CASES = {name: {} for name in agents.AGENTS if family_for(name) == "finger-spin"
 }
 
 
-@pytest.mark.parametrize("name", slow_but(CASES, "care", "text"))
+@pytest.mark.parametrize("name", slow_but(CASES, "care", "text", nightly=True))
 def test_all_forms_act_as_the_policy(name, tmp_path):
     """On tasks that trained and on others, whose context and nearest task are found inside."""
     if name == "text":
@@ -73,6 +73,7 @@ def test_all_forms_act_as_the_policy(name, tmp_path):
     assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, sizes, expected)
 
 
+@pytest.mark.slow
 def test_a_choice_is_the_policys_in_all_forms(tmp_path):
     """Of a family of discrete actions: a number, of which every one is chosen somewhere."""
     env = mtjax.make("two-goal-maze-seen")
@@ -96,6 +97,7 @@ def test_a_choice_is_the_policys_in_all_forms(tmp_path):
     assert_onnx_acts(policy, tmp_path / "policy.onnx", obs, boxes, expected)
 
 
+@pytest.mark.slow
 def test_several_choices_are_the_policys_in_all_forms(tmp_path):
     """Numbers side by side, each of which differs somewhere."""
     env = Levers(vary={"turn": "0:3"}, split="none", num_draws=8)
@@ -125,7 +127,7 @@ COSTLY = {f"cheetah-run-vary-{name}" for name in ("back-foot-length", "foot-posi
 CHEAP = [name for name in FEW if "vary" in name and name not in COSTLY][::2]
 
 
-@pytest.mark.parametrize("name", slow_but([name for name in FEW if "vary" in name], *CHEAP))
+@pytest.mark.parametrize("name", slow_but([name for name in FEW if "vary" in name], *CHEAP, nightly=True))
 @pytest.mark.slow
 def test_a_file_knows_every_listed_task_by_its_parameters(name):
     """By the number and by the context that the family gives it; an unlisted one has no number of theirs."""
@@ -139,6 +141,7 @@ def test_a_file_knows_every_listed_task_by_its_parameters(name):
     assert policy.task_of(jnp.asarray(values[0] + 0.003)).id == len(listed.id)
 
 
+@pytest.mark.slow
 def test_an_equally_near_task_is_the_lower_one_however_it_is_rounded():
     """Among 200 tasks, all that lie midway between two; a file's contexts differ from the family's by rounding."""
     env = mtjax.make("finger-spin", vary={"size": "0.95:1.13:200"})
@@ -283,7 +286,8 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("way", slow_but(WAYS, "recurrent"))
+@pytest.mark.slow
+@pytest.mark.parametrize("way", slow_but(WAYS, "recurrent", nightly=True))
 @pytest.mark.parametrize("scores", one_in(2, [False, True]))
 def test_a_memory_goes_into_the_file(way, scores, tmp_path):
     """By NumPy and by JAX: actions, and memories through the episodes of a trial, for one world and for a batch."""
@@ -321,6 +325,7 @@ def test_a_policy_without_a_memory_begins_none(tmp_path):
         reader.begin()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_exported_is_refused(tmp_path, monkeypatch):
     """In a line, and nothing is overwritten."""
     monkeypatch.setitem(sys.modules, "onnx", None)

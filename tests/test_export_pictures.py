@@ -58,7 +58,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", slow_but(CASES, "drq"))
+@pytest.mark.parametrize("name", slow_but(CASES, "drq", nightly=True))
 def test_every_form_acts_as_the_policy(name, tmp_path):
     """For training tasks and for one between them. Files take of an observation what the policy needs."""
     agent, env, settings = CASES[name]
@@ -125,6 +125,7 @@ def test_parameters_that_are_not_read_may_be_left_out(file, tmp_path):
     assert by_onnx(model, episode(BESIDE), 0.0)[1] == {"pixels", "state"}
 
 
+@pytest.mark.slow
 def test_pictures_that_no_policy_saw_are_refused(file):
     policy, obs = standalone.load(file), jax.tree.map(lambda x: x[0], episode(BESIDE))
     for wrong, said in (

@@ -265,6 +265,7 @@ def test_given_values_replace_the_familys_own():
     np.testing.assert_allclose(fixed.tasks().params["size"], 1.1)
 
 
+@pytest.mark.slow
 def test_what_episodes_draw_is_told_as_a_range():
     """And has no value in tables; tasks that are held out have one."""
     env = envs.make("finger-spin", {"size": "0.9:1.1", "touch-size": "0.1,0.2"})

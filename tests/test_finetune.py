@@ -168,7 +168,7 @@ def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune)
             assert moved == (MOVES[tune] in path), path
 
 
-@pytest.mark.parametrize("name", slow_but(["simba-v2", "xqc"]))
+@pytest.mark.parametrize("name", slow_but(["simba-v2", "xqc"], nightly=True))
 def test_weights_of_length_one_stay_and_statistics_follow_the_data(name, tmp_path):
     """With heads that learn alone: from the nearest task's statistics, which are no parameters."""
     begun = train(tmp_path, "--env=aim", "--split=none", f"--agent={name}", "--seeds=2", "--agent.hidden", "8")

@@ -79,7 +79,7 @@ PARTS = {
 }
 SPECS = {"drq-pictures": SEEN, "asymmetric": BESIDE, "sac-ae-pictures": SEEN}  # what agents see, if not vectors
 QUICK = ["sac", "care"]
-EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK))
+EVERY_AGENT = pytest.mark.parametrize("case", slow_but(PARTS, *QUICK, nightly=True))
 
 
 def start(case, seed=0):

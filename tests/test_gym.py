@@ -677,6 +677,7 @@ def test_a_forked_process_is_refused_with_the_fix(made, monkeypatch):
             use()
 
 
+@pytest.mark.slow
 def test_a_policy_with_a_memory_plays_a_trial_here_as_in_an_evaluation():
     """``reset`` keeps the task, and the memory goes on over the ends of episodes: the same actions."""
     family, agent = (

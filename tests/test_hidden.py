@@ -107,6 +107,7 @@ class Bayes(Stub):
         return memory + jnp.outer(jax.nn.one_hot(transition.action, 2, dtype=jnp.int32), outcome)
 
 
+@pytest.mark.slow
 def test_the_best_strategy_earns_in_trials_what_it_must():
     """As exactly computed, to four standard errors of 20,000 trials; it learns which arm is better."""
     pulls, trials = 10, 20_000
@@ -207,6 +208,7 @@ def test_worlds_that_make_no_sense_are_refused(cls, given, said):
 # What is seen.
 
 
+@pytest.mark.slow
 def test_pictures_show_a_walker_and_hide_the_goal_that_films_show():
     """The picture that an agent observes is the same for all goals, and changes with the cell."""
     env = GridNavi(size=3, pixels=32)

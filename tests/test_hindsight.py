@@ -225,7 +225,7 @@ class Auditor(Stub):
         return state + 1, {"wrong": jnp.max(wrong, axis=1), "spread": jnp.std(scale * jnp.ones_like(wrong), axis=1)}
 
 
-@pytest.mark.parametrize("drawn", [False, True])
+@pytest.mark.parametrize("drawn", one_in(2, [False, True]))
 def test_the_loop_learns_from_relabelled_batches(drawn):
     """Over two seeds: every reward is what the task of its row of the batch pays, and its context is that task's."""
     settings = {

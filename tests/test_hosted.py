@@ -172,14 +172,14 @@ def original_steps(family, episodes, actions):
     ("name", "settings", "kinds"),
     [
         ("Walk", {"vary": {"scale": "0.5:1.5:2"}, "split": "none"}, 2),
-        ("Walk", {"time_limit": 30, "end": 20}, 1),  # it truncates by itself
+        pytest.param("Walk", {"time_limit": 30, "end": 20}, 1, marks=pytest.mark.slow),  # it truncates by itself
         ("Walk", {"vary": {"scale": "1:4"}, "num_draws": 5, "split": "none"}, 2),  # every episode draws its own
-        ("Seen", {"end": 3}, 2),
+        pytest.param("Seen", {"end": 3}, 2, marks=pytest.mark.slow),
         ("Levers", {"end": 3}, 2),
         ("Switches", {}, 2),
-        ("CartPole-v1", {"time_limit": 25}, 2),
+        pytest.param("CartPole-v1", {"time_limit": 25}, 2, marks=pytest.mark.slow),
         ("Pendulum-v1", {"vary": {"g": "5,10"}, "split": "none"}, 1),
-        ("MountainCarContinuous-v0", {"time_limit": 50}, 1),
+        pytest.param("MountainCarContinuous-v0", {"time_limit": 50}, 1, marks=pytest.mark.slow),
     ],
 )
 def test_steps_are_the_originals(name, settings, kinds, begun):

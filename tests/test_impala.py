@@ -48,6 +48,7 @@ def test_a_batch_holds_vtrace_of_the_present_policy_and_critic():
             np.testing.assert_allclose(batch.advantage[task, place], expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_scales_of_rewards_do_not_weigh_tasks():
     """Rewards a thousand times as large give the same advantages, once the units have moved to them."""
     agent = small(value_rate=1.0)

@@ -115,6 +115,7 @@ def test_windows_are_relabelled_whole():
     assert np.all(np.diff(rows.obs[..., 1], axis=-1) == 4)  # of one environment, one after another
 
 
+@pytest.mark.slow
 def test_soft_values_are_those_of_the_critics_over_the_temperature():
     """Of each task's own networks, on steps that are labelled as its own."""
     agent = tiny("sac-conditioned", hindsight=0.5, hindsight_choice="inverse")

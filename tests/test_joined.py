@@ -58,6 +58,7 @@ def require_as_alone(env: Mixture, split="train", atol=0.0):
             np.testing.assert_array_equal(metrics[name][:, :, places], own)
 
 
+@pytest.mark.slow
 def test_families_of_one_structure_share_a_simulator():
     """Masses differ, and so do the rows of each family; a family of another structure stays alone."""
     families = [mtjax.make(name, vary, engine="c") for name, vary in PENDULUMS.items()]
@@ -94,6 +95,7 @@ def test_settings_of_physics_keep_families_apart():
     ]
 
 
+@pytest.mark.slow
 @needs("metaworld")
 def test_meta_worlds_tasks_of_one_scene_step_together():
     """Goals move the window in both. One split has a task of the second family alone."""

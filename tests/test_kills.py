@@ -83,7 +83,7 @@ def interrupted(start, root, steps, rounds, number):
     "number, rounds, steps",
     [
         pytest.param(signal.SIGKILL, 3, 15 * SAVE, marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, 3, 15 * SAVE, marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, 3, 15 * SAVE, marks=pytest.mark.nightly),
         pytest.param(signal.SIGKILL, 20, 120 * SAVE, marks=pytest.mark.nightly),
         pytest.param(signal.SIGTERM, 20, 120 * SAVE, marks=pytest.mark.nightly),
     ],

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Broken, Lost, Probe, Stub, Unsound, Walk, tasks_of, tiny, train
+from probes import Broken, Lost, Probe, Stub, Unsound, Walk, one_in, tasks_of, tiny, train
 
 import mtjax
 from mtjax.config import configure
@@ -202,7 +202,7 @@ def test_a_bad_reward_is_not_blamed_on_the_tasks_that_share_the_networks():
     assert second == env.broken_age < first
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf, 2e10])
+@pytest.mark.parametrize("value", one_in(3, [np.nan, -np.inf, 2e10]))
 def test_the_episode_of_a_lost_world_is_cut_off(monkeypatch, value):
     """It leaves a step without reward that goes nowhere and bootstraps. Its return does not count; another begins."""
     monkeypatch.setattr(loop, "_MOST_LOST", 1.0)
@@ -244,7 +244,7 @@ def test_one_lost_world_stops_no_run_however_short_its_chunks():
 
 
 @pytest.mark.parametrize("early", [True, False])
-@pytest.mark.parametrize("share", [0.05, 1.0])
+@pytest.mark.parametrize("share", one_in(2, [1.0, 0.05]))
 def test_an_episode_that_begins_with_no_number_is_a_bad_step(share, early):
     """The step before it, of its task alone, or the first of the chunk. No world is lost: the next step has numbers."""
     state, (metrics,) = train(Unsound(share=share, early=early), Recorder(), {**SETTINGS, "stagger": False})

@@ -81,6 +81,7 @@ def test_a_step_is_that_of_the_original(name):
     np.testing.assert_array_equal(after.metrics["success"], recorded["success"][before + 1])
 
 
+@pytest.mark.slow
 @needs("metaworld")
 def test_the_hand_follows_its_target_inside_the_box():
     """At most 0.01 m a step, and the gripper closes as the action says."""
@@ -241,6 +242,7 @@ def test_benchmarks_have_the_tasks_of_the_original():
         assert [family.removeprefix("metaworld-") for family in own] == expected
 
 
+@pytest.mark.slow
 @needs("metaworld")
 def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
     """Its record is read back, its settings are each family's, and flags apply to all."""

@@ -317,6 +317,7 @@ def test_every_family_steps_as_it_does_alone(split):
             np.testing.assert_array_equal(same(ours), same(theirs))
 
 
+@pytest.mark.slow
 def test_one_task_of_any_family_steps_as_it_does_alone():
     """One program plays every task, whose number it does not know; the other families' worlds stay to the bit."""
     env, tasks = BOTH, BOTH.tasks()
@@ -605,7 +606,7 @@ def init_and_update(agent, tasks: Task, batch: Transition, key):
     return state, new, metrics, jax.vmap(act)(tasks, batch.obs[:, 0])
 
 
-@pytest.mark.parametrize("name", one_in(4, OFF_POLICY))
+@pytest.mark.parametrize("name", one_in(4, OFF_POLICY, nightly=True))
 def test_every_agent_learns_a_mixture(name):
     """That it can be traced; what it computes, those agents show that are compiled below."""
     arguments = (BOTH.tasks(), random_batch(BOTH), jax.random.key(0))
@@ -853,6 +854,7 @@ def test_tasks_are_numbered_without_building_them(name):
         assert values.dtype == told.dtype and env.counts[split] == len(tasks.id)
 
 
+@pytest.mark.slow
 def test_families_of_several_choices_mix_where_their_sizes_are_equal():
     """All tasks have all choices, and each family gets what the policy chose."""
     env = mixture([Levers(vary={"turn": "0,1"}, split="none"), Levers(vary={"turn": "2"}, split="none")])

@@ -123,7 +123,7 @@ class Auditor(Stub):
         return state, {"wrong": jnp.max(wrong, axis=1), "count": jnp.mean(count, axis=1)}
 
 
-@pytest.mark.parametrize("stagger", [False, True])
+@pytest.mark.parametrize("stagger", one_in(2, [True, False]))
 def test_the_loop_learns_from_joined_steps(stagger):
     """Over two seeds, a ring that wraps around, and episodes that terminate or are cut off, in step or staggered."""
     settings = {"num_envs": 4, "batch_size": 32, "replay_size": 44, "warmup_steps": 3, "chunk_steps": 40, "n_step": 3}
@@ -141,6 +141,7 @@ class Unlike(Walk):
         return jax.random.uniform(key, (1,), minval=0.5)
 
 
+@pytest.mark.slow
 def test_relabelled_windows_have_the_new_goal_in_every_step():
     """All rewards of a window are of the batch's task, wherever its steps come from."""
     settings = {"num_envs": 4, "batch_size": 32, "replay_size": 80, "warmup_steps": 9, "chunk_steps": 20, "n_step": 3}
@@ -170,6 +171,7 @@ def test_each_task_has_its_own_discount():
         np.testing.assert_allclose(batch.discount[task], alive * gamma**count, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_sweep_joins_by_the_swept_discount():
     """And not by that of the agent whose numbers are varied."""
     tasks, steps, key = tasks_of("one-step"), windows(2), jax.random.key(0)
@@ -203,6 +205,7 @@ def test_units_of_a_task_scale_joined_rewards_as_its_values():
     np.testing.assert_allclose(target, expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_past_at_the_bootstrap_is_that_of_the_windows_last_step():
     """An agent that infers its task sees the steps before s_(t+m), and not those of a joined step."""
     agent = tiny("sac", conditioning="inferred", inferred_from=2, experience=Replay(n_step=3))

@@ -106,7 +106,7 @@ def agent_of(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", slow_but(CASES, "ppo"))
+@pytest.mark.parametrize("case", slow_but(CASES, "ppo", nightly=True))
 def test_networks_learn_from_a_tree_what_they_learn_from_its_vector(case):
     """Bit for bit, whoever reads observations: moments, last steps, a memory of the episode, hindsight."""
     agent = agent_of(case)
@@ -152,6 +152,7 @@ def seen_by(env, count=3):
     return task, jax.vmap(lambda state: env.step(task, state, jnp.ones(2)))(begun.state).obs
 
 
+@pytest.mark.slow
 def test_policies_take_trees_and_batches_of_them():
     """One, as dictionaries of NumPy's arrays or of lists, or a batch; and what is missing is told in a line."""
     policy, flat = policy_of(TREE), policy_of(FLAT)
@@ -214,6 +215,7 @@ def test_gymnasium_has_a_space_for_every_array():
         assert env.observation_space.contains(obs) and obs["env_obs"]["near"][0].dtype == bool
 
 
+@pytest.mark.slow
 def test_a_mixture_joins_and_pads_the_arrays_of_its_families():
     """The vectors that networks see, of the widest family."""
     both = mtjax.mixture([TREE, mtjax.make("two-goal-maze", scores=True)])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import QUICK, assessed, only_seed, pick, quick, tasks_of, tiny, train
+from probes import QUICK, assessed, one_in, only_seed, pick, quick, tasks_of, tiny, train
 from test_ppo import KNOWN, LEARN, SCALES
 from test_sketches import Corridor
 
@@ -181,7 +181,7 @@ def rollout(agent, state, length=4, envs=2, seed=0):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("how", ["task", "none"])
+@pytest.mark.parametrize("how", one_in(2, ["none", "task"]))
 def test_targets_are_those_of_a_plain_loop(how):
     """One task, world and step at a time, by the equations."""
     agent = made(gae_lambda=0.7, advantage_normalization=how, value_normalization="none")
@@ -219,6 +219,7 @@ def test_targets_are_those_of_a_plain_loop(how):
     close(found.end_loss, wanted["end"] / std)
 
 
+@pytest.mark.slow
 def test_the_batch_is_what_was_stored():
     agent = made()
     state = begun(agent)
@@ -232,6 +233,7 @@ def test_the_batch_is_what_was_stored():
 # Acting.
 
 
+@pytest.mark.slow
 def test_an_option_runs_on_until_it_ends_and_ratios_are_one():
     """With a key it is kept where it did not end; what is stored is the log-probability of what was drawn."""
     agent = made(end_bias=0.0)
@@ -255,6 +257,7 @@ def test_an_option_runs_on_until_it_ends_and_ratios_are_one():
     assert 5 < kept < 55
 
 
+@pytest.mark.slow
 def test_stop_ends_an_option_and_the_other_outputs_say_what_it_does():
     """By hand: with outputs ln 1, ln 2 and ln 3 it ends with 3 in 6, and draws 1 to 2; without action 0, 3 in 5."""
     agent = made(endings="stop")
@@ -285,7 +288,7 @@ def test_options_begin_to_end_by_stop_as_often_as_by_terminations():
     np.testing.assert_allclose(ends, jax.nn.sigmoid(-1.0), atol=0.01)
 
 
-@pytest.mark.parametrize("bias, length", [(-2.0, 6), (0.1, 1), (-1.0, 3)])
+@pytest.mark.parametrize("bias, length", one_in(3, [(-2.0, 6), (0.1, 1), (-1.0, 3)]))
 def test_without_a_key_an_option_lasts_as_long_as_it_would_with_probability_one_half(bias, length):
     """(1 - sigmoid(bias))^n falls below one half at the n-th step: there the next is chosen."""
     agent = made(end_bias=bias)

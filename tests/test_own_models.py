@@ -288,6 +288,7 @@ def test_values_may_be_negative_where_physics_has_such():
     assert min(model.dof_damping[-1] for model in own(falling(), **positive).models) > 0
 
 
+@pytest.mark.slow
 def test_a_model_says_itself_what_it_lacks():
     """MuJoCo did not refuse it, so nothing is said of MuJoCo."""
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from needs import needs, require
 from PIL import Image
+from probes import slow_but
 
 import mtjax
 from mtjax.envs.engines.base import World
@@ -44,7 +45,7 @@ DOMAINS = (
 FURTHER = ("finger-turn-hard", "reacher-hard", "swimmer-swimmer15", "cheetah-run-looks")  # other sizes and colours
 LOOKS = {"hue": "0,100", "floor-hue": "0,80", "sky-hue": "0,-60", "light": "1,0.5", "camera-angle": "0,25"}
 MAZES = ("corridor-maze", "two-goal-maze")
-QUICK = ("corridor-maze", "finger-turn-easy")
+QUICK = ("finger-turn-easy",)
 TARGETS = {  # in states that are not of play
     "finger-turn": [0.1, 0.07],
     "fish": [0.1, 0.1, 0.2],
@@ -121,9 +122,7 @@ def drawn(name):
     return np.asarray(jax.jit(jax.vmap(family(name).look_at, (None, 0)))(task_of(name), states_of(name))["pixels"])
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in DOMAINS + FURTHER + MAZES]
-)
+@pytest.mark.parametrize("name", slow_but(DOMAINS + FURTHER + MAZES, *QUICK, nightly=True))
 def test_pictures_are_those_of_mujocos_renderer(name):
     """But for its smooth edges. It draws no shadows here, which no painter does. A shifted picture is less alike."""
     for i, picture in enumerate(drawn(name)):
@@ -162,6 +161,7 @@ def test_cameras_and_lights_are_those_of_dm_control(name):
             close(getattr(model, f"light_{name}")[i], getattr(theirs.model, f"light_{name}")[i])
 
 
+@pytest.mark.slow
 def test_a_target_s_light_hangs_above_it():
     """In observations and in films."""
     env = family("swimmer-swimmer6")
@@ -246,6 +246,7 @@ def test_rays_meet_every_shape_where_mujocos_do():
     np.testing.assert_allclose(distance[same], depths[same], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_normals_stand_on_every_shape():
     """Against the change of distance from one ray to the next, as ``mj_ray`` sees it."""
     model, data = moved_shapes(1)

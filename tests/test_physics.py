@@ -235,6 +235,7 @@ def test_default_iterations_are_near_the_converged_solver(programs):
     assert_within(worst(exact.state.qvel, early.state.qvel), {0.75: 1e-3, 0.9: 2, 1: 25})
 
 
+@pytest.mark.slow
 def test_c_agrees_with_itself_under_every_nesting_of_maps(worlds):
     """Seeds x tasks x environments in one callback are the single calls, bit for bit."""
     env = make(SIZE, "c")
@@ -329,6 +330,7 @@ def test_set_physics_returns_the_given_state(engine, worlds, programs):
     assert not np.any(world.warmstart)
 
 
+@pytest.mark.slow
 def test_nothing_ever_terminates():
     """A whole episode of random actions: finite throughout, and never over."""
     env = make(SIZE, "c")

@@ -79,6 +79,7 @@ def test_repeated_actions_sum_rewards_and_keep_the_limit_in_seconds():
     assert twice.seconds_per_step == 2 * once.seconds_per_step
 
 
+@pytest.mark.slow
 def test_looks_change_what_is_seen_and_nothing_of_the_physics():
     """Beside a parameter of the physics, whose models stay those of the family without pictures."""
     vary = (("hue", "0,120"), ("camera-angle", "-20,20"), ("floor-hue", "0,60"), ("light", "0.5,1"), ("mass", "1,2"))
@@ -119,6 +120,7 @@ def test_ranges_of_looks_are_drawn_by_episodes_and_split_like_others():
     assert len(env.tasks("interpolation").id) == 5 and len(env.tasks("extrapolation").id) == 4
 
 
+@pytest.mark.slow
 def test_grey_and_plain_pictures():
     grey = play(pictured(grey=True), ())[0].obs["pixels"]
     assert grey.shape == (SIZE, SIZE, 1) and np.std(grey) > 1

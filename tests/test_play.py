@@ -41,6 +41,7 @@ def node(script, *words, given=""):
     return done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_episodes_in_javascript_are_those_of_mujoco():
     """Of all tasks, held-out ones too: every place of the ball, and returns."""
     policy = load(make_play.RUN)

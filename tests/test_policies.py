@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Levers, of_task, tiny
+from probes import Levers, of_task, slow_but, tiny
 
 import mtjax
 from mtjax.agents import for_action
@@ -288,7 +288,7 @@ def test_ppo_finds_the_best_places_of_two_levers():
     np.testing.assert_array_equal(result.evaluations.returns["train"][:, -1], 6)
 
 
-@pytest.mark.parametrize("name", ["ppo", "impala", "rl2", "maml", "options"])
+@pytest.mark.parametrize("name", slow_but(["ppo", "impala", "rl2", "maml", "options"], "ppo", "options"))
 def test_agents_train_on_several_choices(name):
     """Traced, not run: the loop, agent and tasks fit together."""
     agent = for_action(tiny(name, unroll=4, minibatches=1, epochs=1), LEVERS.action)

@@ -27,7 +27,8 @@ from mtjax.training import finetune
 from mtjax.types import InputError
 
 PAGE = Path(__file__).parents[1] / "docs/results/policies.md"
-NEEDED = {"mt10/brc": [needs("metaworld")]}
+# What a policy needs to be scored, or that it takes a minute.
+MARKS = {"mt10/brc": [needs("metaworld")], "brax-ant-vary-direction/ppo": [pytest.mark.nightly]}
 
 
 @pytest.mark.slow
@@ -128,7 +129,7 @@ def test_a_policy_of_the_package_has_no_checkpoints_to_choose_from():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(name, marks=NEEDED.get(name, ())) for name in pretrained.names()])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in pretrained.names()])
 def test_a_policy_scores_what_its_page_says(name):
     """The return on training tasks in the table, within what two other episodes of each task may differ.
 

@@ -236,7 +236,7 @@ def chances_of_goals(cells, possible, goals):
     return np.where(met[..., None], goal, left / np.maximum(left.sum(axis=-1, keepdims=True), 1)), met
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_varibad_learns_where_the_goal_of_a_grid_can_be():
     """What is predicted of arriving in a cell is 1.1 P - 0.1, P being its chance to be the goal.
 
@@ -311,6 +311,7 @@ def trial_of(track):
     return np.cumsum(closed, axis=1) - closed
 
 
+@pytest.mark.slow
 def test_varibads_losses_by_hand():
     """Every belief predicts all steps of its trial, and parts from the one before it."""
     made = knowing("varibad", decoded_steps=99, state_coefficient=0.5, kl_coefficient=0.3)
@@ -336,6 +337,7 @@ def test_varibads_losses_by_hand():
     assert float(loss) == pytest.approx(7 + np.mean(decoding) + np.mean(parted), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_some_steps_stand_for_all_of_a_trial():
     """The loss of two steps that are drawn is that of all six on average, also where the trial has fewer."""
     whole, some = (knowing("varibad", decoded_steps=count, kl_coefficient=0.0) for count in (6, 2))
@@ -347,6 +349,7 @@ def test_some_steps_stand_for_all_of_a_trial():
     assert every.mean() == pytest.approx(few.mean(), abs=4 * few.std() / np.sqrt(3000))
 
 
+@pytest.mark.slow
 def test_cadms_losses_by_hand():
     """Every context predicts the next steps of its window and trial, forward and backward."""
     made = knowing("cadm", decoded_steps=2, backward_coefficient=0.7)

@@ -306,7 +306,7 @@ def test_the_loss_of_values_trains_the_convolution():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vision", ["grid", "drq"])
+@pytest.mark.parametrize("vision", [pytest.param("grid", marks=pytest.mark.nightly), "drq"])
 def test_what_only_pictures_show_is_learned(vision):
     """The best of five actions, a task's scale times a sign that the picture shows; and that it is worth 0."""
     seeing = SEEING if vision == "grid" else {"representation": "encoded", "latent_widths": (16,)}

@@ -84,7 +84,7 @@ def test_the_policy_finds_the_best_action_of_each_task():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", slow_but(OFF_POLICY, "pcgrad"))
+@pytest.mark.parametrize("name", slow_but(OFF_POLICY, "pcgrad", nightly=True))
 def test_every_agent_learns_values_and_actions(name):
     """On the probe that needs observation, action and task; an agent that is not told its task gets two alike."""
     scales = (0.7, 0.7) if name == "sac" else SCALES

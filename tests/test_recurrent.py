@@ -113,6 +113,7 @@ def test_critics_do_not_move_the_policy():
     assert history[0]["ratio"].max() < 1e-4
 
 
+@pytest.mark.slow
 def test_values_at_the_end_of_a_window_know_the_last_step():
     """What follows a step is judged with the state after it, also if memory begins anew there. It knows of no end."""
     agent = tiny("ppo", unroll=LENGTH, gae_lambda=0.0, advantage_normalization="none", **RECURRENT)
@@ -134,6 +135,7 @@ def test_values_at_the_end_of_a_window_know_the_last_step():
             hidden = jnp.where(step.ended, knowing.begin(3, 2), after)
 
 
+@pytest.mark.slow
 def test_sac_learns_from_windows_that_begin_with_the_stored_state():
     """All steps of a window count, and another stored state gives other losses."""
     agent = tiny("sac", recurrent_steps=4, **RECURRENT)

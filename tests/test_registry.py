@@ -60,8 +60,11 @@ def play(env, tasks, keys):
 
 
 SAME_BODIES = {"brax-humanoidstandup", "brax-halfcheetah-vary-speed", "brax-ant-vary-direction"}  # as others'
+LONG = ("dog-run", "errands", "racing")  # seconds each
 AT_THE_ENDS = [pytest.param(x, marks=pytest.mark.nightly) for x in ENVS if x in SAME_BODIES]
-AT_THE_ENDS += slow_but([name for name in ENVS if name not in SAME_BODIES], *QUICK[::4])
+AT_THE_ENDS += slow_but(
+    [name for name in ENVS if name not in SAME_BODIES], *[name for name in QUICK[::4] if name not in LONG]
+)
 
 
 @pytest.mark.parametrize("name", AT_THE_ENDS)
@@ -85,7 +88,7 @@ def test_family_steps_at_the_ends_of_its_range(name):
         np.testing.assert_array_equal(plain(one), plain(other))  # after its end a world may be anything, but the same
 
 
-@pytest.mark.parametrize("name", slow_but(ENVS, *FEW[::2]))
+@pytest.mark.parametrize("name", slow_but(ENVS, *FEW[::2], nightly=True))
 def test_family_round_trips_its_tasks(name):
     """A task is found again by its number, has its own name, and is unlike every other of its family."""
     env = mtjax.make(name)
@@ -364,7 +367,7 @@ def test_a_brax_family_with_a_reward_of_its_own_is_accepted(forget):
     assert mtjax.make("mine").train_count == 2 and type(mtjax.make("mine").original.sys.link_names) is list
 
 
-@pytest.mark.parametrize("name", slow_but([name for name in ENVS if name.startswith("brax-")], "brax-fast"))
+@pytest.mark.parametrize("name", slow_but([x for x in ENVS if x.startswith("brax-")], "brax-fast", nightly=True))
 def test_every_family_of_brax_passes_the_check(name):
     registration_checks.check(mtjax.make(name))
 

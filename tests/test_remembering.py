@@ -238,7 +238,7 @@ def test_a_command_switches_off_what_a_preset_has_and_packnet_refuses():
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_fine_tuning_forgets_where_packnet_does_not():
     """Of four goals, the first: what its mean return of three seeds, at most 100, loses by the end of the third."""
     given = {"num_tasks": 4, "num_envs": 8, "chunk_steps": 1000, "curriculum": "sequence:2000", "hidden": (64, 64)}

@@ -71,6 +71,7 @@ def test_redo_waits_for_its_turn():
     assert [changed(jnp.int32(number)) for number in (0, 8, 9, 10, 19)] == [False, False, True, False, True]
 
 
+@pytest.mark.slow
 def test_critics_are_renewed_each_by_its_own_units():
     """At a threshold above all activities every unit of both begins anew, with weights of its own."""
     agent, state, batch = made("redo", redo_every=1, dormant_threshold=1e9)
@@ -92,6 +93,7 @@ def test_continual_backprop_replaces_one_mature_unit_at_a_time():
     assert ages[2][1] == [0] + [3] * 5
 
 
+@pytest.mark.slow
 def test_shrinking_and_perturbing_changes_what_tasks_share_alone():
     agent, state, _ = made("shrink-and-perturb", shrink=0.25, perturb=0.5, heads="per-task")
     fresh = agent.init(Walk().spec, TASKS, jax.random.key(9))

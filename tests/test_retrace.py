@@ -59,6 +59,7 @@ def targets_of(agent, steps):
     return quick(compute, steps)(steps)
 
 
+@pytest.mark.slow
 def test_targets_are_those_worked_step_by_step():
     """Soft values after steps, plain ones of actions, the lower critic, ratios up to 1, and no sum over ends."""
     agent, steps = tracing("sac-conditioned"), windows()

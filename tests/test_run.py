@@ -317,6 +317,7 @@ def test_a_run_is_stopped_from_within(play, whole, tmp_path):
     assert_same_run(play(tmp_path, resume=True), whole)
 
 
+@pytest.mark.slow
 def test_broken_run_goes_on_from_its_last_checkpoint(play, whole, tmp_path):
     """Rows that the checkpoint does not know are dropped and written again."""
 
@@ -529,6 +530,7 @@ def test_evaluations_after_the_checkpoint_are_dropped(play, whole, tmp_path):
     assert_same_run(play(tmp_path, resume=True), whole)
 
 
+@pytest.mark.slow
 def test_finished_run_can_be_extended(play, whole, tmp_path):
     """More steps go on as if they had been asked for at once."""
     assert play(tmp_path, steps=400).finished

@@ -236,6 +236,7 @@ def test_temperature_and_target_begin_as_set():
     assert not np.allclose(kernel[0], kernel[1])
 
 
+@pytest.mark.slow
 def test_each_transition_is_seen_with_its_own_episodes_context(linear):
     """Contexts stored beside transitions take the place of the tasks' own, sample by sample."""
     tasks, key = tasks_of("one-step", [0.4, -0.8]), jax.random.key(1)

@@ -134,6 +134,7 @@ def test_an_update_weighs_losses_by_the_temperatures_of_the_time():
     np.testing.assert_allclose(heads[1], heads[0] * weights[:, None, None, None], rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_an_agent_hands_its_sampler_what_it_observes():
     """Its memory changes, and nothing else does."""
     watching = tiny("sac", sampler="hardest")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import SHORT_RUN
-from probes import Stub, Walk, tiny, train_objects
+from probes import Stub, Walk, one_in, tiny, train_objects
 from test_pictures import Episodes
 from test_run import bytes_of
 
@@ -127,7 +127,7 @@ class Rounds:
         )
 
 
-@pytest.mark.parametrize("window", [0, 3])
+@pytest.mark.parametrize("window", one_in(2, [3, 0]))
 def test_every_age_is_drawn_in_the_share_that_the_module_tells(window):
     """Ages of the first steps of windows, at the ends of chunks: as the segments' starts say, and nearly uniform."""
     slots, stored, chunk, rounds = 160, 500, 10, 400

@@ -136,6 +136,7 @@ def test_there_is_no_cache_unless_it_is_asked_for(folder, times, monkeypatch):
     assert same(run(times), run(times)) and times.traced == 2 and not folder.exists()
 
 
+@pytest.mark.slow
 def test_whatever_decides_a_program_is_in_its_key(folder, times, monkeypatch, tmp_path):
     """Settings, what their files hold, shapes, JAX's configuration, the environment and the code."""
     file = tmp_path / "vectors.npy"

@@ -63,6 +63,7 @@ def test_one_pass_over_a_window_is_its_steps_one_by_one():
     assert filled >= {0, 3} and filled & {1, 2}
 
 
+@pytest.mark.slow
 def test_a_trial_begins_with_nothing():
     """After the step that closes a trial networks see 0, and then the same as if no steps had been before."""
     params, track = params_of(KNOWING), track_of(begun(KNOWING), ends=0.0)

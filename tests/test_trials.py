@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import SPEC, Goals, Stub, Walk, slow_but, tiny, train
+from probes import SPEC, Goals, Stub, Walk, one_in, slow_but, tiny, train
 from test_loop import Drifting
 
 import mtjax
@@ -130,6 +130,7 @@ def test_only_the_end_of_a_trial_is_terminal(drifting):
     np.testing.assert_array_equal(rows.discount[..., 4:], 1.0 - (rows.closed & ~limit)[..., 4:])
 
 
+@pytest.mark.slow
 def test_a_trial_is_terminal_where_its_length_is_part_of_the_problem():
     """Whatever ends its last episode."""
     rows, *_ = play(Finite())
@@ -150,7 +151,7 @@ class Still(Stub):
         return jnp.zeros(5)
 
 
-@pytest.mark.parametrize("curriculum", ["all", "sequence:60"])
+@pytest.mark.parametrize("curriculum", one_in(2, ["all", "sequence:60"]))
 def test_a_mixtures_limit_is_part_of_the_problem_in_those_families_alone_where_it_is(curriculum):
     """As in each of them by itself: sums of rewards run through a trial there, and are cut elsewhere."""
     grid, table = mtjax.make("grid-navi", size=3, steps=3, scores=True), Brief(scores=True, num_tasks=1)
@@ -404,6 +405,7 @@ def test_a_run_s_evaluations_know_their_trials(tmp_path, capsys):
         require_same_run(tmp_path, found, other)
 
 
+@pytest.mark.slow
 def test_evaluations_play_whole_trials_unless_they_are_told_how_many_episodes(capsys):
     """Three of four episodes, by default, where ten were no whole trials."""
     assert mtjax.evaluate("grid-navi/rl2", quiet=True).returns["train"].shape == (1, 1, 12)
@@ -475,6 +477,7 @@ def test_a_lost_world_does_not_go_on(monkeypatch):
     np.testing.assert_array_equal(restarted, np.all(rows.obs == rows.next_obs, axis=-1)[..., :-1])
 
 
+@pytest.mark.slow
 def test_a_goal_of_a_body_is_drawn_anew_and_the_body_stays():
     """A point mass goes on from where it is: nothing that it observes jumps."""
     env = mtjax.make("point-mass-vary-goal", combine="grid", engine="c", num_draws=8)

@@ -68,6 +68,7 @@ def test_an_update_in_the_actors_turn_is_the_whole_one_and_another_leaves_the_ac
     np.testing.assert_array_equal(others["actor_loss"].weight, 0)
 
 
+@pytest.mark.slow
 def test_turns_pass_through_a_sweep():
     """An agent with traced numbers takes them too."""
     agent, batch = tiny("sac", experience=Replay(policy_delay=2)), random_batch(0, 2, 4, SPEC)
@@ -123,7 +124,7 @@ class Turns(Stub):
         return jnp.float32(0)
 
 
-@pytest.mark.parametrize(("updates", "delay"), [(1, 3), (3, 2)])
+@pytest.mark.parametrize(("updates", "delay"), one_in(2, [(3, 2), (1, 3)]))
 def test_metrics_of_the_actor_are_means_over_its_turns(updates, delay):
     """And empty for a chunk without any."""
     given = {**SMALL, "chunk_steps": 7, "updates_per_step": updates, "policy_delay": delay}
@@ -185,7 +186,7 @@ def test_a_ring_holds_whole_iterations_and_wraps_around_between_them():
     assert goes_on.any()
 
 
-@pytest.mark.parametrize(("every", "resets"), [(1, 3), (4, 3)])
+@pytest.mark.parametrize(("every", "resets"), one_in(2, [(1, 3), (4, 3)]))
 def test_networks_are_reset_as_often_however_often_the_agent_learns(every, resets, monkeypatch):
     """After 5, 10 and 15 of 20 steps, at the next time of updates."""
     monkeypatch.setattr(loop, "reset_networks", Recorder.reset)

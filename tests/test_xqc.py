@@ -121,6 +121,7 @@ def test_statistics_are_those_of_both_ends_of_every_tasks_own_batch(heads):
     assert STATISTICS not in critic.shared and critic.own[STATISTICS]["BatchNorm_1"]["var"].shape == (3, 2, 16)
 
 
+@pytest.mark.slow
 def test_statistics_are_no_other_tasks():
     """Another batch of the second task changes its statistics alone, in the same update."""
     _, state, update = started()
