@@ -238,11 +238,11 @@ def slow_but(names, *quick, nightly=False):
 
 
 def _later(cases, nightly):
-    """Mark cases that are not quick as slow, and three of seven of these as ``nightly`` too, if that is so.
+    """Mark cases that are not quick as slow, and four of seven of these as ``nightly`` too, if that is so.
 
     Seven has no divisor in common with the length of most inner loops over cases, so that all values are in the rest.
     """
-    late = lambda i, quick: [pytest.mark.nightly] if nightly and not quick and i % 7 in (1, 3, 5) else []
+    late = lambda i, quick: [pytest.mark.nightly] if nightly and not quick and i % 7 in (1, 3, 5, 6) else []
     made = [(param(case, slow=not quick), late(i, quick)) for i, (case, quick) in enumerate(cases)]
     return [pytest.param(*case.values, marks=[*case.marks, *marks]) for case, marks in made]
 

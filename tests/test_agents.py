@@ -52,7 +52,7 @@ SURGERY = [("embedding" if name == "sac" else "parameters", name) for name in OF
 
 
 def some(cases, every):
-    """Cases of which one in so many is for the default, four of seven others for .ci/run; less those that cannot be."""
+    """Cases of which one in so many is quick and most others are nightly, less those that cannot be."""
     cases = [(name, settings) for name, settings in cases if valid(name, **settings)]
     return one_in(every, cases, nightly=True)
 

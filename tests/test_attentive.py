@@ -142,7 +142,7 @@ def test_a_grid_is_as_it_says(grids):
     assert not any(tuple(start) in {(0, 0), (0, 6), (6, 0), (6, 6)} for start in starts.tolist())
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_sub_networks_learn_swapped_actions_and_one_learns_half(grids):
     """Blind to the task, the same actions lead to one end in one task and to the other in the other."""
     one, two = (grids.learned(grids.CORRIDOR, grids.shared(count), 60, seeds=2)[1] for count in (1, 2))

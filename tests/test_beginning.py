@@ -191,7 +191,7 @@ def test_what_does_not_fit_is_refused_before_a_folder_is_made(folder, words, sai
 # Learning.
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_new_order_is_learned_without_its_sketch_sooner_than_from_scratch():
     """First right, then left, by sub-policies of other orders that stay as they are; both ways are of 4,096 steps."""
     learn = {"gamma": 0.95, "actor_lr": 3e-3, "critic_lr": 3e-3}

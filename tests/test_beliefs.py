@@ -133,7 +133,7 @@ def test_nothing_is_drawn_of_what_never_changes():
     assert len(beliefs._draw(found._replace(foretold=told), "x")) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_draws_one_run_with_a_belief(tmp_path, capsys, monkeypatch):
     """A run's folder, a result and a policy alike."""
     monkeypatch.chdir(tmp_path)

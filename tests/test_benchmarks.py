@@ -656,7 +656,7 @@ def test_a_policy_plays_only_what_it_was_trained_on(script, tmp_path, monkeypatc
 
 
 @needs("metaworld")
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_trained_policy_plays_meta_world_as_it_acts(script, tmp_path):
     env = mtjax.make("metaworld-window-open+metaworld-reach", num_draws=2)
     settings = {"num_envs": 1, "batch_size": 2, "replay_size": 100, "warmup_steps": 2, "chunk_steps": 5}
@@ -904,7 +904,7 @@ def test_halving_is_compared_on_the_same_trials(script):
     assert script("halving").compared(whole, halved) == [9.0, 8.0, 2, 0.25, 2, 2]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_updates_are_timed_with_their_numbers_as_data(script, monkeypatch, capsys):
     numbers = script("traced_numbers")
     for name, small in {"TASKS": 2, "BATCH": 4, "UPDATES": 2, "ROUNDS": 1}.items():

@@ -95,7 +95,7 @@ PENDULUM_MJX = Brax(environment="inverted_pendulum", backend="mjx")
     "env",
     [
         pytest.param(ANT, id="ant", marks=pytest.mark.nightly),
-        pytest.param(CHEETAH, id="halfcheetah", marks=slow),
+        pytest.param(CHEETAH, id="halfcheetah", marks=pytest.mark.nightly),
         pytest.param(PENDULUM_MJX, id="inverted_pendulum-mjx", marks=slow),
     ],
 )
@@ -247,7 +247,7 @@ def test_tasks_and_worlds_step_in_one_scan():
 SMALL = ("fast", "inverted_pendulum")
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in SMALL else slow) for name in NAMES])
+@pytest.mark.parametrize("name", slow_but(NAMES, *SMALL, nightly=True))
 def test_every_environment_traces(name):
     """Reset and step trace on this JAX, and a state keeps its shapes and dtypes."""
     env = Brax(environment=name)

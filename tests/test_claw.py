@@ -139,7 +139,7 @@ def test_worlds_go_on_forward_and_backward_where_episodes_end():
     assert np.all(np.abs(np.asarray(state.worlds.state.qpos)[..., 1:]).max(axis=-1) > 0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mjx_steps_the_claw_as_c_does(count=32):
     """From worlds in which random actions have moved it for a while; in contact the solver stops sooner in float32."""
     other = mtjax.make("claw", engine="mjx", solver_iterations=50)

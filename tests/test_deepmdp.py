@@ -434,7 +434,7 @@ def test_theta_of_an_unseen_task_is_inferred_from_its_last_steps():
     assert describe_unseen(agent) == "each has a theta inferred from its last steps"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_guess_finds_the_theta_of_the_task_that_steps_were_taken_in():
     """Rewards of a step tell the task; after training each task's guess is near its own theta."""
     agent = make("hip-bmdp", critic_lr=1e-2, **INFERRED)
@@ -491,7 +491,7 @@ def test_the_transition_model_learns_linear_dynamics():
     assert np.all(spread > 0.01) and np.all(error < 0.2 * spread), (error, spread)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_values_are_learned_through_the_slow_encoder():
     """Two steps of which the last earns the scale: Q(1) = scale and Q(0) = gamma scale, whatever the action."""
     rates = {"tau": 0.3, "encoder_tau": 0.3, "actor_lr": 1e-2, "critic_lr": 1e-2}

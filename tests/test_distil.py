@@ -292,7 +292,7 @@ def test_a_record_tells_who_teaches(tmp_path):
     assert from_json(again / "config.json").learner == third.learner
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_that_was_taught_needs_its_teachers_no_more(tmp_path):
     """Two teachers of a task each; the policy is loaded, and goes on to the bit, when their folders are gone."""
     runs = [run_of(tmp_path, "--env=aim", f"--env.vary.goal={goal}", "--split=none", *PPO) for goal in ("0.5", "-1")]

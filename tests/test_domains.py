@@ -215,7 +215,7 @@ def test_model_and_timing_are_those_of_dm_control(name):
     assert (env.num_substeps, env.episode_length) == (theirs.num_substeps, theirs.episode_length)
 
 
-@pytest.mark.parametrize("name", slow_but(SUITE, *[name for name in FIRST if name not in SLOW][::4]))
+@pytest.mark.parametrize("name", slow_but(SUITE, *[name for name in FIRST if name not in SLOW][::4], nightly=True))
 def test_a_step_gives_the_observation_and_reward_of_dm_control(name):
     """Of 400 states, or 100 of the dog, the 25 of highest reward and 25 others, to rounding in float32."""
     env, theirs, random = make(name), load(name), np.random.default_rng(0)

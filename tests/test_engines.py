@@ -126,7 +126,7 @@ def alone(engine, task, world, action):
     return state, np.float32(data.sensordata)
 
 
-@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY][::8]))
+@pytest.mark.parametrize("name", slow_but(DOMAINS, *[name for name in DOMAINS if name not in HEAVY][::8], nightly=True))
 def test_c_steps_as_plain_mujoco_does(name):
     """Bit for bit in every world, for three steps of which the later ones go on from the batch's own state."""
     tasks, world, action, _ = played(name)
@@ -178,7 +178,7 @@ def compiled_step(name, env, play):
 @pytest.mark.parametrize(
     "name",
     [
-        *slow_but([name for name in ALIKE if name not in LONG], *QUICK_DOMAINS),
+        *slow_but([name for name in ALIKE if name not in LONG], *QUICK_DOMAINS, nightly=True),
         *(pytest.param(name, marks=pytest.mark.nightly) for name in LONG),
     ],
 )

@@ -219,7 +219,7 @@ def test_other_convolutions_are_refused(setting, values):
         steps_of(jax.make_jaxpr(apply)(jnp.zeros((1, 8, 8, 4))))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_exports_a_run_from_pictures(tmp_path, capsys):
     """What it writes plays an episode that the reader's own stacks show it."""
     small = dict(hidden=(8,), latent_widths=(4,), num_envs=2, batch_size=4, replay_size=100, warmup_steps=10)

@@ -155,7 +155,7 @@ def tuned(base, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tune", slow_but(MOVES))
+@pytest.mark.parametrize("tune", slow_but(MOVES, nightly=True))
 def test_what_is_tuned_moves_and_all_else_stays_to_the_bit(learned, tuned, tune):
     """From the networks of the run's seeds, and of the nearest tasks."""
     expected = inherited(learned.states, [0, 1, 0])

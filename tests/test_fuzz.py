@@ -66,7 +66,7 @@ def require_use_or_refusal(words, folder):
     assert from_json(folder / "config.json") == config
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @long
 @given(words=lines)
 def test_any_command_line_is_used_or_refused(words, tmp_path):
@@ -184,7 +184,7 @@ def require_read_or_refused(record, folder):
         assert process.one_line(error)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_any_edited_record_is_read_or_refused(record, tmp_path):
     """Every place with some other value, and every place without any."""
     for number, path in enumerate(places(record)):

@@ -402,7 +402,7 @@ def test_spaces_of_spaces_are_trees_of_arrays():
     assert mtjax.hosted(Turned, time_limit=5).spec.obs == jax.ShapeDtypeStruct((), jnp.int32)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", slow_but(("sac", "ppo"), "ppo"))
 def test_networks_learn_from_spaces_of_spaces_what_they_learn_from_one(name):
     """Bit for bit, with the arrays in the replay as the environment has them."""

@@ -270,7 +270,7 @@ def test_regret_is_what_a_policy_earns_less(process):
     assert expected > 10
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_earlier_tasks_teach(tmp_path, monkeypatch):
     """Each learner of each panel has less regret than the last one, which was taught nothing; and a figure is drawn."""
     found = identify.measure(3)

@@ -181,7 +181,7 @@ def returns(agent, env, states, split):
     return np.asarray(score(states, tasks, seeds, jnp.int32(0)).returns)[0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_hidden_task_is_told_by_its_rewards():
     """Who remembers acts right from the second step on, also in tasks it has not seen; who does not, never can.
 

@@ -163,9 +163,8 @@ def steps_in(text, pattern):
     return int(found[1].replace(",", "")) if found else 0
 
 
-@pytest.mark.parametrize(
-    "kills", [pytest.param(2, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("kills", [2, 10])
 def test_a_hosted_run_loses_at_most_a_chunk_each_time_it_is_killed(start, tmp_path, world, kills):
     """At random moments. It says how much, and its rows and evaluations are those of a whole run."""
     total, chance = 20 * kills * CHUNK, random.Random(kills)

@@ -243,7 +243,7 @@ class Aims(Probe):
         return tasks_of(self.kind, self.scales, self.episode_length)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_network_learns_to_adapt_to_tasks_it_has_not_met():
     """The best for all tasks at once earns -0.4 in those of training, and -0.36 in those between them."""
     made, seeds = agent("maml", hidden=(16, 16), unroll=1, epochs=1, actor_lr=3e-3, entropy_cost=0.01), jnp.uint32([0])

@@ -261,7 +261,7 @@ def test_a_benchmark_is_a_mixture_by_a_name(tmp_path):
 
 
 @needs("metaworld")
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_held_out_tasks_are_evaluated_and_an_agent_learns(tmp_path):
     """A few steps of ml10, with success at the end and at any step of each task's episodes."""
     run = mtjax.train(

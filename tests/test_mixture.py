@@ -616,7 +616,7 @@ def test_every_agent_learns_a_mixture(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", one_in(3, ["distral", "hip-bmdp", "brc", "xqc", "simba-v2", "pcgrad"]))
+@pytest.mark.parametrize("name", one_in(3, ["distral", "hip-bmdp", "brc", "xqc", "simba-v2", "pcgrad"], nightly=True))
 def test_an_update_is_finite_and_acts_where_there_are_actions(name):
     agent = tiny(name, normalize_observations=True, discounting="horizon")
     run = lambda *arguments: init_and_update(agent, *arguments)
@@ -825,7 +825,7 @@ def test_families_that_look_otherwise_do_not_mix():
     [
         ("drq", {}),
         pytest.param("drq", {"representation": "asymmetric"}, marks=pytest.mark.nightly),
-        ("ppo", {"representation": "encoded"}),
+        pytest.param("ppo", {"representation": "encoded"}, marks=pytest.mark.nightly),
     ],
 )
 def test_agents_learn_a_mixture_of_pictures(monkeypatch, name, settings):

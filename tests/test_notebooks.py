@@ -8,7 +8,7 @@ import pytest
 from needs import require
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-LONG = ("ablation", "own_encoder", "unseen_tasks")  # they take a minute each
+LONG = ("ablation", "own_encoder", "own_family", "unseen_tasks")  # they take a minute each
 RUN = [pytest.param(x, marks=pytest.mark.nightly if x.stem in LONG else pytest.mark.slow) for x in NOTEBOOKS]
 LARGEST = 200_000  # bytes, pictures included
 

@@ -244,7 +244,7 @@ def test_observations_are_trees_of_any_shape_and_dtype(kind, forget):
     return None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_family_that_is_registered_with_pictures_is_learned(forget):
     """By an agent that sees."""
     mtjax.register("own-corridor", CorridorMaze, pixels=16)

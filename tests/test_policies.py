@@ -240,7 +240,7 @@ def optimum():
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ppo_learns_tabular_mdps(optimum):
     """Its greedy actions in every state return at least 97% of what value iteration's do, in every task."""
     env, (optimal, reward) = mtjax.make("tabular-mdp", num_tasks=4), optimum
