@@ -59,12 +59,11 @@ def play(env, tasks, keys):
     return start, *jax.lax.scan(step, start.state, jnp.arange(STEPS))
 
 
-SAME_BODIES = {"brax-humanoidstandup", "brax-halfcheetah-vary-speed", "brax-ant-vary-direction"}  # as others'
+SHORT = ("ant", "fast", "inverted-pendulum")  # of Brax's, those that compile in seconds, and an ant
+NIGHTLY = [name for name in ENVS if name.startswith("brax-") and not name.endswith(SHORT)]
 LONG = ("dog-run", "errands", "racing")  # seconds each
-AT_THE_ENDS = [pytest.param(x, marks=pytest.mark.nightly) for x in ENVS if x in SAME_BODIES]
-AT_THE_ENDS += slow_but(
-    [name for name in ENVS if name not in SAME_BODIES], *[name for name in QUICK[::4] if name not in LONG]
-)
+AT_THE_ENDS = [pytest.param(name, marks=pytest.mark.nightly) for name in NIGHTLY]
+AT_THE_ENDS += slow_but([x for x in ENVS if x not in NIGHTLY], *[x for x in QUICK[::4] if x not in LONG])
 
 
 @pytest.mark.parametrize("name", AT_THE_ENDS)
@@ -157,7 +156,7 @@ def forget():
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("name", slow_but(OWN))
+@pytest.mark.parametrize("name", slow_but(OWN, nightly=True))
 def test_parts_and_agents_of_ones_own_are_trained(name, short_family, forget, tmp_path, capsys):
     """The worked examples, by the command line, and again from the run's own record; each is under 60 lines."""
     kind, own, flags = OWN[name]

@@ -170,7 +170,7 @@ def test_a_text_needs_the_conditioning():
         tiny("sac", conditioning="parameters", text="some-model")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_reads_and_its_policy_acts_on_held_out_tasks(hashing, tmp_path):
     """From training to a saved policy, whose vectors are those of all splits, and its scores on held-out tasks."""
     family = mtjax.make("finger-spin", vary={"size": "0.9,1.1"})
