@@ -216,6 +216,12 @@ def caches_of_tests():
     return [x for x in own if hasattr(x, "cache_clear")]
 
 
+@pytest.fixture
+def random():
+    """What a test draws from: the same numbers, whichever tests ran before it."""
+    return np.random.default_rng(0)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs():
     """Drop what files have compiled and cached, and what JAX has, once the process is full.

@@ -63,9 +63,9 @@ def test_the_importance_of_a_gaussian_policy():
     assert float(found["s"]) == pytest.approx(2 / 0.4**2, rel=1e-5)
 
 
-def test_the_importance_is_the_curvature_of_the_divergence():
+def test_the_importance_is_the_curvature_of_the_divergence(random):
     """Of log-probabilities, which weigh pi: the diagonal of the second derivative of KL(pi | pi_theta) at pi."""
-    x, params = np.float32(RANDOM.normal(size=(5, 2))), {"w": jnp.float32(RANDOM.normal(size=(2, 3)))}
+    x, params = np.float32(random.normal(size=(5, 2))), {"w": jnp.float32(random.normal(size=(2, 3)))}
     outputs = lambda params, x: jax.nn.log_softmax(x @ params["w"])
     found = forgetting.ewc(outputs, jnp.exp, params, x)
 
@@ -94,12 +94,12 @@ def network(params, x):
     return (hidden @ params["second"]["kernel"])[:, 0]
 
 
-def blank():
-    normal = lambda *shape: jnp.float32(RANDOM.normal(size=shape))
+def blank(random):
+    normal = lambda *shape: jnp.float32(random.normal(size=shape))
     return {"first": {"kernel": normal(2, 32), "bias": normal(32)}, "second": {"kernel": normal(32, 1) / 6}}
 
 
-def learn(params, owners, owner, x, y, seen, steps=300):
+def learn(params, owners, owner, x, y, seen, steps=1000):
     """Learn y (N,) by AdamW, which decays all weights, with those that ``owner`` has."""
     optimizer = optax.adamw(1e-2, weight_decay=0.01)
     error = lambda params: jnp.mean(jnp.square(network(seen(params), x) - y))
@@ -122,11 +122,11 @@ def learn_pruned(params, owners, task, share, x, y):
 
 
 @pytest.mark.slow
-def test_later_tasks_change_nothing_of_earlier_ones_to_the_bit():
+def test_later_tasks_change_nothing_of_earlier_ones_to_the_bit(random):
     """Though they are others, and the optimiser decays weights; and each is learned."""
-    x = jnp.float32(RANDOM.normal(size=(40, 2)))
+    x = jnp.float32(random.normal(size=(40, 2)))
     tasks = [jnp.sin(2 * x[:, 0]), x[:, 1], jnp.abs(x[:, 0])]
-    params, then = blank(), []
+    params, then = blank(random), []
     owners = forgetting.unowned(params)
     outputs = jax.jit(lambda params, owners, task: network(forgetting.seen_by(params, owners, task), x))
     for i, y in enumerate(tasks, 1):

@@ -198,12 +198,12 @@ def test_a_one_hot_weight_picks_one_set(chosen):
         assert np.any(leaf[chosen] != 0) and not np.any(leaf[np.array(others)])
 
 
-def test_composing_once_is_composing_for_every_sample():
+def test_composing_once_is_composing_for_every_sample(random):
     """The layer takes weights (K,) or (B, K): the same function by two ways."""
     module, x, weights = Composed(5), DATA[0], jnp.float32([0.3, -1.2, 0.7])
     params = parameters(module, x, weights)
     close(apply(module, params, x, jnp.tile(weights, (BATCH, 1))), apply(module, params, x, weights))
-    every = jnp.float32(RANDOM.normal(size=(BATCH, 3)))
+    every = jnp.float32(random.normal(size=(BATCH, 3)))
     rows = [apply(module, params, x[i], every[i]) for i in range(BATCH)]
     close(apply(module, params, x, every), np.stack(rows))
 
@@ -219,13 +219,13 @@ def test_a_hypernetwork_writes_every_hidden_layer():
     close(apply(module, params, *DATA), np.stack(rows))
 
 
-def test_generated_kernels_begin_as_usual_ones_and_the_same_for_all_tasks():
+def test_generated_kernels_begin_as_usual_ones_and_the_same_for_all_tasks(random):
     """LeCun's variance 1 / inputs, no bias; and yet the features move them after a step."""
-    module, obs = HyperTrunk((8, 4), (90, 70), False), jnp.float32(RANDOM.normal(size=(BATCH, 50)))
+    module, obs = HyperTrunk((8, 4), (90, 70), False), jnp.float32(random.normal(size=(BATCH, 50)))
     params = compiled(module.init)(jax.random.key(0), obs, DATA[1])
     for name, size in (("Composed_0", 50), ("Composed_1", 90)):
         layer = params["params"]["trunk"][name]
-        code = np.concatenate([[1.0], RANDOM.normal(size=4)])  # any code writes the same kernel
+        code = np.concatenate([[1.0], random.normal(size=4)])  # any code writes the same kernel
         np.testing.assert_allclose(np.var(np.tensordot(code, layer["kernels"], 1)), 1 / size, rtol=0.1)
         assert not np.any(np.tensordot(code, layer["biases"], 1))
     run = compiled(module.apply)
@@ -269,9 +269,9 @@ def test_weights_of_tasks_along_one_parameter_are_not_a_line(name, num):
     assert effective_rank(weights()) >= 4
 
 
-def test_weights_of_a_task_fit_what_a_line_cannot():
+def test_weights_of_a_task_fit_what_a_line_cannot(random):
     """Ten tasks' random weights, of which the best line leaves three quarters; every task reaches its own."""
-    contexts, wanted = jnp.linspace(-1, 1, 10)[:, None], jnp.float32(RANDOM.normal(size=(10, 5)))
+    contexts, wanted = jnp.linspace(-1, 1, 10)[:, None], jnp.float32(random.normal(size=(10, 5)))
     module, optimizer = TaskWeights(5, (64,)), optax.adam(1e-2)
     loss = lambda params: jnp.mean((module.apply(params, contexts) - wanted) ** 2)
 
@@ -352,12 +352,12 @@ def test_features_of_the_task_or_of_every_sample_are_the_same(name):
 
 
 @EVERY_MODULE
-def test_every_parameter_gets_a_gradient(name):
+def test_every_parameter_gets_a_gradient(name, random):
     """Each leaf, and each module's or set's slice of it."""
     module = MODULES[name]
-    obs, features, action = (jnp.float32(RANDOM.normal(size=(64, size))) for size in (OBS, CONTEXT, ACTION))
+    obs, features, action = (jnp.float32(random.normal(size=(64, size))) for size in (OBS, CONTEXT, ACTION))
     params = parameters(module, obs, features, action)
-    target = jnp.float32(RANDOM.normal(size=64))[:, None]
+    target = jnp.float32(random.normal(size=64))[:, None]
     loss = lambda params: jnp.sum((module.apply(params, obs, features, action) - target) ** 2)
     for path, slope in jax.tree_util.tree_leaves_with_path(compiled(jax.grad(loss))(params)):
         rows = slope if slope.ndim == 3 or path[-1].key == "biases" else slope[None]

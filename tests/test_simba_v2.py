@@ -15,7 +15,6 @@ from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
-RANDOM = np.random.default_rng(0)
 
 
 def unit(x):
@@ -32,12 +31,12 @@ def lengths(direction):
     return np.linalg.norm(direction, axis=-2)
 
 
-def test_the_body_is_its_equations():
+def test_the_body_is_its_equations(random):
     """Embedding, two blocks and the last hidden layer, with random parameters and a task's features."""
-    obs, features, action = (jnp.float32(RANDOM.normal(size=size)) for size in ((4, 3), (2,), (4, 2)))
+    obs, features, action = (jnp.float32(random.normal(size=size)) for size in ((4, 3), (2,), (4, 2)))
     module = Hypersphere(expansion=3, input_shift=2.0).body((6, 6), layer_norm=False)
     start = module.init(jax.random.key(0), obs, features, action)
-    params = jax.tree.map(lambda x: jnp.float32(RANDOM.normal(size=x.shape)), start)
+    params = jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), start)
     layers = jax.tree.map(np.float64, params["params"])
     dense = lambda i, x: x @ layers[f"UnitDense_{i}"]["direction"]
     # A factor is its parameter times how it begins, over how the parameter begins.
@@ -71,9 +70,9 @@ def test_a_step_ends_on_the_sphere_and_others_are_as_they_were():
     np.testing.assert_array_equal(after["kernel"], [[3.0], [4.0]])
 
 
-def test_what_is_not_tuned_stays_to_the_bit():
+def test_what_is_not_tuned_stays_to_the_bit(random):
     """Though scaling it to length 1 again would round."""
-    weights = jnp.float32(RANDOM.normal(size=(5, 7)))
+    weights = jnp.float32(random.normal(size=(5, 7)))
     params = Params({"body": {"direction": weights}, "head": {"direction": weights}}, {})
     optimizer = adam(0.1, 0.0, 0.0, "heads")
     updates, _ = optimizer.update(jax.tree.map(jnp.ones_like, params), optimizer.init(params), params)

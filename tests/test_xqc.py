@@ -15,7 +15,6 @@ from mtjax.types import InputError, Spec
 
 SPEC, BATCH = Spec.vector(3, 2, 1), 4
 TASKS = tasks_of("one-step", (1.0, -0.5, 0.3))
-RANDOM = np.random.default_rng(0)
 KEY = jax.random.key(0)
 EVERY_HEADS = pytest.mark.parametrize("heads", slow_but(["shared", "per-task", "disjoint"], "per-task"))
 
@@ -81,12 +80,12 @@ def test_a_layer_normalises_by_the_batch_by_hand():
     np.testing.assert_allclose(out[:, 0], np.maximum(((np.array([1, 2, 3, 6]) - 2) / 3 - 2) / 3 + 1, 0), rtol=1e-5)
 
 
-def test_the_body_is_its_equations():
+def test_the_body_is_its_equations(random):
     """Two layers with random parameters and a task's features, which the batch's mean does not take away."""
-    obs, features, action = (jnp.float32(RANDOM.normal(size=size)) for size in ((4, 3), (2,), (4, 2)))
+    obs, features, action = (jnp.float32(random.normal(size=size)) for size in ((4, 3), (2,), (4, 2)))
     module = BatchNorm().body((6, 5), layer_norm=False)
     start = module.init(KEY, obs, features, action)
-    params = jax.tree.map(lambda x: jnp.float32(RANDOM.normal(size=x.shape)), start["params"])
+    params = jax.tree.map(lambda x: jnp.float32(random.normal(size=x.shape)), start["params"])
     p = jax.tree.map(np.float64, params)
 
     def normalized(i, x):
@@ -184,10 +183,10 @@ def test_an_action_is_that_of_the_tasks_own_running_statistics():
     assert "statistics of the nearest training task" in describe_unseen(made)
 
 
-def test_a_task_is_seen_though_its_features_are_the_same_in_all_of_its_batch():
+def test_a_task_is_seen_though_its_features_are_the_same_in_all_of_its_batch(random):
     """Other features change the outputs in a batch: a mean over it would have taken them away before the layers."""
     network = Network(BatchNorm().body((8, 8), layer_norm=False))
-    obs = jnp.float32(RANDOM.normal(size=(6, 3)))
+    obs = jnp.float32(random.normal(size=(6, 3)))
     params = of_task(network.init(KEY, 1, 1, jnp.zeros(2), obs[0]), 0)
     one, two = (network.fit(params, jnp.float32(z), obs)[0] for z in ([1.0, 0.0], [0.0, 1.0]))
     assert np.abs((one - one.mean()) - (two - two.mean())).max() > 1e-2
