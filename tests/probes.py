@@ -219,12 +219,13 @@ def family_for(agent: str) -> str:
     return "finger-spin" if Gaussian in agents.AGENTS[agent].cls.policies else "tabular-mdp"
 
 
-def param(case, slow=False):
+def param(case, slow=False, nightly=False):
     """A case, or several values in a tuple, as a test's parameters, marked with the packages that they need."""
     values = case if isinstance(case, tuple) else (case,)
     words = [word for value in values for word in (value.values() if isinstance(value, dict) else (value,))]
     packages = [_PACKAGES[word] for word in words if isinstance(word, str) and word in _PACKAGES]
-    return pytest.param(*values, marks=[*map(needs, packages), *([pytest.mark.slow] if slow else [])])
+    marks = [*map(needs, packages), *([pytest.mark.slow] if slow else []), *([pytest.mark.nightly] if nightly else [])]
+    return pytest.param(*values, marks=marks)
 
 
 def one_in(count, cases, nightly=False):
@@ -242,9 +243,8 @@ def _later(cases, nightly):
 
     Seven has no divisor in common with the length of most inner loops over cases, so that all values are in the rest.
     """
-    late = lambda i, quick: [pytest.mark.nightly] if nightly and not quick and i % 7 in (1, 3, 5, 6) else []
-    made = [(param(case, slow=not quick), late(i, quick)) for i, (case, quick) in enumerate(cases)]
-    return [pytest.param(*case.values, marks=[*case.marks, *marks]) for case, marks in made]
+    late = lambda i: nightly and i % 7 in (1, 3, 5, 6)
+    return [param(case, slow=not quick, nightly=late(i) and not quick) for i, (case, quick) in enumerate(cases)]
 
 
 # The loop and the replay with which SAC learns what a probe asks for.

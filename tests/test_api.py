@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import ShortFinger
-from probes import Probe, tiny
+from probes import Probe, param, tiny
 
 import mtjax
 import mtjax.evaluate
@@ -176,13 +176,9 @@ _REDO = {"encoder": "identity", "unit_head": False, "plasticity": "redo"}
     [
         ("sac", {"scaling": "ars", "reset_every": 1000}),
         ("simba-v2", _REDO),
-        pytest.param(
-            "drq",
-            {"pixels": 32, "n_step": 1, "conditioning": "recurrent", "representation": "plain"},
-            marks=pytest.mark.slow,
-        ),
-        pytest.param("drq", {"pixels": 32, "n_step": 1, "target": "retrace"}, marks=pytest.mark.slow),
-        pytest.param("drq", {"pixels": 32, "n_step": 1, "representation": "deepmdp"}, marks=pytest.mark.slow),
+        param(("drq", {"pixels": 32, "n_step": 1, "conditioning": "recurrent", "representation": "plain"}), slow=True),
+        param(("drq", {"pixels": 32, "n_step": 1, "target": "retrace"}), slow=True),
+        param(("drq", {"pixels": 32, "n_step": 1, "representation": "deepmdp"}), slow=True),
         ("rl2", {"minibatches": 3, "unroll": 16}),
         ("sac", {"hidden": (8, 8, 8), "tune": "all", "combine": "grid", "split": "none", "stagger": False}),
     ],

@@ -111,7 +111,7 @@ def test_nominal_parameters_give_the_trajectory_of_brax(env):
     assert ours.reward.dtype == np.float32 and ours.terminated.dtype == bool
 
 
-@pytest.mark.slow
+@slow
 def test_a_fall_terminates():
     """Random pushes topple the pendulum within twenty steps, and not at the first."""
     terminated = rollout(PENDULUM_MJX).terminated[:, 0]
@@ -144,7 +144,7 @@ def test_a_falling_ant_obeys_its_gravity():
     assert np.all(step.terminated)  # as the ant must keep its torso between 0.2 and 1 m
 
 
-@pytest.mark.slow
+@slow
 def test_an_edited_system_is_what_brax_loads_from_an_edited_model():
     """Every leaf: what MuJoCo derives from masses (constraint weights) included."""
     from brax.io import mjcf
@@ -216,7 +216,7 @@ def test_goals_are_parameters_of_their_families():
         BraxAntDirection(vary={"direction": "4"})
 
 
-@pytest.mark.slow
+@slow
 def test_tasks_and_worlds_step_in_one_scan():
     """Three gravities, five worlds, sixty steps with fresh starts after falls: a heavier pole falls sooner."""
     tasks = PENDULUM.tasks()
@@ -288,7 +288,7 @@ def test_what_has_nothing_to_see_is_not_filmed():
     assert modes == [["rgb_array"], []]
 
 
-@pytest.mark.slow
+@slow
 def test_a_film_of_a_world_without_a_camera_shows_all_of_it():
     """Or says what to install."""
     tasks = PENDULUM.tasks()

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from needs import needs, require
 from own_process import environment
-from probes import quick, slow_but
+from probes import one_in, quick, slow_but
 
 from mtjax import envs
 from mtjax.envs.engines import base as physics
@@ -255,9 +255,7 @@ def test_a_process_may_end_while_its_worlds_still_step():
     subprocess.run([sys.executable, "-c", ENDS_EARLY], env=environment(), check=True, timeout=120)
 
 
-@pytest.mark.parametrize(
-    ("name", "sensors"), [("finger-spin", True), pytest.param("walker-walk", False, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("name", "sensors"), one_in(2, [("finger-spin", True), ("walker-walk", False)]))
 def test_c_results_do_not_depend_on_what_the_batch_did_before(name, sensors):
     """After a start, a question of contact, other worlds or other tasks, a step is that of a fresh engine.
 

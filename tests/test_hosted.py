@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from needs import needs, require
-from probes import slow_but, tiny, train
+from probes import param, slow_but, tiny, train
 
 import mtjax
 import mtjax.train
@@ -172,14 +172,14 @@ def original_steps(family, episodes, actions):
     ("name", "settings", "kinds"),
     [
         ("Walk", {"vary": {"scale": "0.5:1.5:2"}, "split": "none"}, 2),
-        pytest.param("Walk", {"time_limit": 30, "end": 20}, 1, marks=pytest.mark.slow),  # it truncates by itself
+        param(("Walk", {"time_limit": 30, "end": 20}, 1), slow=True),  # it truncates by itself
         ("Walk", {"vary": {"scale": "1:4"}, "num_draws": 5, "split": "none"}, 2),  # every episode draws its own
-        pytest.param("Seen", {"end": 3}, 2, marks=pytest.mark.slow),
+        param(("Seen", {"end": 3}, 2), slow=True),
         ("Levers", {"end": 3}, 2),
         ("Switches", {}, 2),
-        pytest.param("CartPole-v1", {"time_limit": 25}, 2, marks=pytest.mark.slow),
+        param(("CartPole-v1", {"time_limit": 25}, 2), slow=True),
         ("Pendulum-v1", {"vary": {"g": "5,10"}, "split": "none"}, 1),
-        pytest.param("MountainCarContinuous-v0", {"time_limit": 50}, 1, marks=pytest.mark.slow),
+        param(("MountainCarContinuous-v0", {"time_limit": 50}, 1), slow=True),
     ],
 )
 def test_steps_are_the_originals(name, settings, kinds, begun):

@@ -235,7 +235,7 @@ def test_default_iterations_are_near_the_converged_solver(programs):
     assert_within(worst(exact.state.qvel, early.state.qvel), {0.75: 1e-3, 0.9: 2, 1: 25})
 
 
-@pytest.mark.slow
+@slow
 def test_c_agrees_with_itself_under_every_nesting_of_maps(worlds):
     """Seeds x tasks x environments in one callback are the single calls, bit for bit."""
     env = make(SIZE, "c")
@@ -255,7 +255,7 @@ def test_c_agrees_with_itself_under_every_nesting_of_maps(worlds):
         assert_same(alone, jax.tree.map(lambda x, i=i: x[i], mapped))
 
 
-@pytest.mark.slow
+@slow
 def test_c_follows_a_change_of_tasks_between_calls(size_contacts, programs):
     """A batch that served some tasks serves the same number of others, and remembers nothing of the first."""
     tasks, world, action = size_contacts
@@ -330,7 +330,7 @@ def test_set_physics_returns_the_given_state(engine, worlds, programs):
     assert not np.any(world.warmstart)
 
 
-@pytest.mark.slow
+@slow
 def test_nothing_ever_terminates():
     """A whole episode of random actions: finite throughout, and never over."""
     env = make(SIZE, "c")
@@ -356,7 +356,7 @@ def test_engine_is_chosen_by_device(monkeypatch):
         physics.choose_engine("c")
 
 
-@pytest.mark.slow
+@slow
 def test_c_serves_two_threads_at_once(worlds):
     """Two threads that step the same family at the same batch size do not mix their worlds."""
     env = envs.make("finger-spin", engine="c")

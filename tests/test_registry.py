@@ -62,7 +62,7 @@ def play(env, tasks, keys):
 SHORT = ("ant", "fast", "inverted-pendulum")  # of Brax's, those that compile in seconds, and an ant
 NIGHTLY = [name for name in ENVS if name.startswith("brax-") and not name.endswith(SHORT)]
 LONG = ("dog-run", "errands", "racing")  # seconds each
-AT_THE_ENDS = [pytest.param(name, marks=pytest.mark.nightly) for name in NIGHTLY]
+AT_THE_ENDS = [param(name, nightly=True) for name in NIGHTLY]
 AT_THE_ENDS += slow_but([x for x in ENVS if x not in NIGHTLY], *[x for x in QUICK[::4] if x not in LONG])
 
 

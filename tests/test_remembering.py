@@ -176,7 +176,7 @@ def test_optimisers_begin_anew_where_a_task_ends():
     [
         ("packnet", {"retrain_updates": 5}),
         param(("ewc", {"fisher_samples": 64}), slow=True),
-        pytest.param("clone", {"clone_samples": 10}, marks=pytest.mark.nightly),
+        param(("clone", {"clone_samples": 10}), nightly=True),
     ],
 )
 def test_a_run_resumes_to_the_bit(tmp_path, name, given):
